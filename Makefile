@@ -1,0 +1,33 @@
+# make demo    set everything up and run the main job on a small made-up dataset
+# make test    set everything up and run the tests
+# make lint    formatting, lint and types
+.PHONY: setup demo test lint clean
+
+PYTHON ?= $(shell command -v python || command -v python3)
+UV := $(shell command -v uv || echo .tools/bin/uv)
+VENV := .venv
+BIN := $(VENV)/bin
+EXTRAS := viz,priors,cluster,dev
+TESTS ?= tests
+
+setup: $(VENV)/.ready
+
+$(VENV)/.ready: pyproject.toml constraints.txt
+	@command -v $(UV) >/dev/null || $(PYTHON) -m pip install --quiet --target .tools uv
+	@test -x $(BIN)/python || $(UV) venv --quiet --python 3.12 $(VENV)
+	$(UV) pip install --quiet --python $(BIN)/python --constraint constraints.txt --editable '.[$(EXTRAS)]'
+	@touch $@
+
+demo: setup
+	$(BIN)/python examples/01_demo.py
+
+test: setup
+	$(BIN)/python -m pytest $(TESTS)
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+clean:
+	rm -rf $(VENV) .tools demo_out

@@ -1,0 +1,101 @@
+"""The static set of a fixed camera: one flat Gaussian per pixel of the temporal median."""
+
+import math
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from lerobot_msdyn.cameras import CameraTrack
+from lerobot_msdyn.geometry import matrix_to_quaternion, transform_points, unproject_image
+from lerobot_msdyn.scene import Gaussians, gaussians_from_points
+
+SIGMA_PX = 0.5  # standard deviation of a Gaussian, as a share of the spacing of its grid
+FLATNESS = 0.2  # thickness along the surface normal, as a share of the width
+MAX_STRETCH = 4.0  # surfaces seen at a grazing angle are stretched at most so much
+OPACITY = 0.95
+
+
+def fill_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Depth (m, 0 = unknown) with each unknown pixel taken from the nearest known one; all unknown: 1 m."""
+    known = (depth > 0).numpy()
+    if not known.any():
+        return torch.ones_like(depth)
+    _, labels = cv2.distanceTransformWithLabels(
+        (~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    values = np.zeros(labels.max() + 1, np.float32)
+    values[labels[known]] = depth.numpy()[known]
+    return torch.from_numpy(values[labels])
+
+
+def surface_frames(points: Float[Tensor, "h w 3"]) -> tuple[Float[Tensor, "h w 3 3"], Float[Tensor, "h w"]]:
+    """Rotations whose third column is the surface normal (towards the camera), and the cosine of the viewing angle."""
+    dx = torch.gradient(points, dim=1)[0]
+    dy = torch.gradient(points, dim=0)[0]
+    normal = torch.nn.functional.normalize(torch.linalg.cross(dy, dx), dim=-1)
+    view = torch.nn.functional.normalize(points, dim=-1)
+    cosine = -(normal * view).sum(-1)
+    # At depth edges the normal means nothing: there the disc faces the camera.
+    doubtful = (cosine < 1 / MAX_STRETCH)[..., None]
+    normal = torch.where(doubtful, -view, normal)
+    # First column: the direction in which the surface recedes, along which a pixel's footprint is stretched.
+    tilt = -view - (-view * normal).sum(-1, keepdim=True) * normal
+    helper = torch.tensor([1.0, 0.0, 0.0]).expand_as(normal)
+    sideways = torch.linalg.cross(normal, helper)
+    first = torch.where(tilt.norm(dim=-1, keepdim=True) > 1e-3, tilt, sideways)
+    first = torch.nn.functional.normalize(first, dim=-1)
+    rotation = torch.stack((first, torch.linalg.cross(normal, first), normal), dim=-1)
+    return rotation, torch.where(doubtful[..., 0], torch.ones_like(cosine), cosine)
+
+
+def pixel_gaussians(
+    rgb: UInt8[Tensor, "h w 3"],
+    depth: Float[Tensor, "h w"],
+    camera: CameraTrack,
+    frame: int,
+    step: int = 1,
+) -> tuple[Gaussians, Float[Tensor, "n 2"]]:
+    """One flat Gaussian for every `step`-th pixel of an image with dense depth (m), and the pixels' centres (px)."""
+    intrinsics = camera.intrinsics[frame]
+    points = unproject_image(depth, intrinsics)
+    rotation, cosine = surface_frames(points)
+    offset = step // 2
+    take = (slice(offset, None, step), slice(offset, None, step))
+    points, rotation, cosine = points[take].reshape(-1, 3), rotation[take].reshape(-1, 3, 3), cosine[take].reshape(-1)
+    width = SIGMA_PX * step * points[:, 2] / intrinsics[0, 0]
+    scales = torch.stack((width / cosine.clamp(min=1 / MAX_STRETCH), width, width * FLATNESS), dim=-1)
+    world_from_camera = camera.world_from_camera[frame]
+    gaussians = gaussians_from_points(
+        means=transform_points(world_from_camera, points),
+        quats=matrix_to_quaternion(world_from_camera[:3, :3] @ rotation),
+        scales=scales,
+        rgb=rgb[take].reshape(-1, 3).float() / 255,
+        opacity=OPACITY,
+    )
+    xy = torch.stack(
+        torch.meshgrid(
+            torch.arange(offset, depth.shape[1], step) + 0.5,
+            torch.arange(offset, depth.shape[0], step) + 0.5,
+            indexing="xy",
+        ),
+        dim=-1,
+    )
+    return gaussians, xy.reshape(-1, 2)
+
+
+def background_gaussians(
+    median: UInt8[Tensor, "h w 3"], depth: Float[Tensor, "h w"], camera: CameraTrack, most: int
+) -> Gaussians:
+    """The static set of a fixed camera from its temporal median of colour and depth (m, 0 = unknown).
+
+    Args:
+        median: colours of the empty scene.
+        depth: z-depth of the empty scene.
+        camera: the camera; its first frame counts.
+        most: bound on the number of Gaussians; above it every second, third, ... pixel is used.
+    """
+    step = max(1, math.ceil(math.sqrt(depth.numel() / most)))
+    return pixel_gaussians(median, fill_depth(depth), camera, 0, step)[0]

@@ -1,0 +1,216 @@
+"""Every field that a recipe or a flag can set, with its default, unit and meaning (the comments are the help texts).
+
+No torch here, so that `--help` answers at once. Recipes are YAML files with the fields of `Recipe`; any field can be
+overridden by a flag of the same dotted name, e.g. `--fit.steps 1000`.
+"""
+
+from dataclasses import dataclass, field, fields, is_dataclass
+from pathlib import Path
+from typing import Literal
+
+import draccus
+
+# Named: draccus finds the comment above a field only where its annotation holds no quotes.
+Device = Literal["auto", "cpu", "cuda"]
+
+
+@dataclass
+class CameraConfig:
+    """Where the cameras' geometry comes from."""
+
+    # JSON file with K (and R, t) of each camera, see docs/calibration.md; without it the camera is taken as fixed.
+    calibration: Path | None = None
+    # Horizontal field of view in degrees, used where no calibration names the camera.
+    horizontal_fov_deg: float = 60.0
+    # Height of the camera above the table in metres, used where no depth is recorded.
+    height_m: float = 0.5
+    # Downward tilt of the camera in degrees, used where no depth is recorded.
+    tilt_deg: float = 35.0
+
+
+@dataclass
+class PriorsConfig:
+    """What is known about a video before the fit."""
+
+    # auto (recorded depth if the dataset has it, else the table plane), recorded, plane, or an .npz file.
+    depth: str = "auto"
+
+
+@dataclass
+class SceneConfig:
+    """How many Gaussians, and from where."""
+
+    # Upper bound for the static set; one Gaussian per pixel of the fitted image where it suffices.
+    static_gaussians: int = 80_000
+    # Upper bound for the moving set.
+    moving_gaussians: int = 20_000
+    # Number of frames from which the moving set is gathered.
+    moving_frames: int = 20
+    # Side of the voxels in which the gathered moving points are merged, in pixels of the fitted image.
+    moving_voxel_px: float = 0.8
+
+
+@dataclass
+class MotionConfig:
+    """The levels of motion."""
+
+    # Rigid parts per moving instance at the object level (a robot arm is one instance with several parts).
+    max_parts: int = 6
+
+
+@dataclass
+class LossWeights:
+    """Weight of each loss term."""
+
+    # Absolute colour difference.
+    rgb: float = 1.0
+    # Absolute difference of inverse depth, relative to the mean inverse depth.
+    depth: float = 0.1
+    # Absolute difference between the drawn share of moving Gaussians and the mask of what moves.
+    mask: float = 0.1
+
+
+@dataclass
+class LearningRates:
+    """Adam step sizes."""
+
+    # Positions, in units of the scene's look-at distance.
+    means: float = 7e-4
+    # Logarithm of scales.
+    log_scales: float = 5e-3
+    # Quaternions.
+    quats: float = 1e-3
+    # Opacity logits.
+    opacity_logits: float = 2e-2
+    # Colour coefficients.
+    colours: float = 5e-3
+
+
+@dataclass
+class FitConfig:
+    """The optimisation."""
+
+    # Number of Adam steps; each draws one frame.
+    steps: int = 300
+    # Widest image that is fitted, in pixels; wider videos are fitted at a reduced size and rendered at their own.
+    max_width: int = 320
+    weights: LossWeights = field(default_factory=LossWeights)
+    learning_rates: LearningRates = field(default_factory=LearningRates)
+
+
+@dataclass
+class PerturbationConfig(draccus.ChoiceRegistry):
+    """How the camera of a new episode differs from the recorded one: one draw per new episode."""
+
+
+@PerturbationConfig.register_subclass("orbit")
+@dataclass
+class OrbitConfig(PerturbationConfig):
+    """Turn the camera about the point it looks at, and shift it."""
+
+    # Largest turn to either side, in degrees.
+    azimuth_deg: float = 10.0
+    # Largest turn up or down, in degrees.
+    elevation_deg: float = 5.0
+    # Largest shift along each of the camera's axes, as a fraction of the distance to the look-at point.
+    translation_rel: float = 0.03
+
+
+@PerturbationConfig.register_subclass("jitter")
+@dataclass
+class JitterConfig(PerturbationConfig):
+    """Shift and turn the camera in place, as if it had been bumped."""
+
+    # Standard deviation of the shift along each of the camera's axes, as a fraction of the look-at distance.
+    translation_rel: float = 0.02
+    # Standard deviation of the turn about each of the camera's axes, in degrees.
+    rotation_deg: float = 1.0
+
+
+@dataclass
+class Recipe:
+    """What to reconstruct and what to render; the fields of a recipe file."""
+
+    # Cameras to re-render, by feature key; the others are copied. Default: all but wrist cameras.
+    cameras: list[str] | None = None
+    # New episodes per source episode.
+    variants: int = 2
+    # Whether the source episodes are copied into the output as well.
+    include_source: bool = True
+    # Seed of every random choice; together with the episode and the variant it fixes the result.
+    seed: int = 0
+    # auto, cpu or cuda.
+    device: Device = "auto"
+    camera: CameraConfig = field(default_factory=CameraConfig)
+    priors: PriorsConfig = field(default_factory=PriorsConfig)
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+    perturbation: PerturbationConfig = field(default_factory=OrbitConfig)
+
+
+@dataclass
+class AugmentConfig(Recipe):
+    """`python -m lerobot_msdyn.augment`: a recipe and where to read and write."""
+
+    # Source dataset (alias: --repo).
+    repo_id: str = ""
+    # Exact folder of the source dataset; default: LeRobot's home, then the hub.
+    root: Path | None = None
+    # Name of the new dataset; default: the source's with _msdyn behind it.
+    new_repo_id: str | None = None
+    # Exact folder of the new dataset; default: LeRobot's home, or beside --root.
+    new_root: Path | None = None
+    # Source episodes to use, e.g. '[0,3]'; default: all.
+    episodes: list[int] | None = None
+    # Report what would be done (episodes, disk, time) and stop.
+    dry_run: bool = False
+
+
+@dataclass
+class EvaluateConfig(Recipe):
+    """`python -m lerobot_msdyn.evaluate nvs`: fit one episode, render its held-out cameras."""
+
+    # Folder with dataset/ (or dataset_depth/) and gt/, see docs/evaluate.md.
+    scene_folder: Path = Path()
+    # Where the rendered views go: OUT/<camera>/rgb_%04d.png.
+    out: Path = Path()
+    # recorded, none, or an .npz file with depth [t,h,w].
+    depth: str = "recorded"
+
+
+def problems(config: object, prefix: str = "") -> list[str]:
+    """One line per value that is out of range, over all nested fields; `config` is any of the classes here."""
+    lines = []
+    for name, low, high in _RANGES.get(type(config).__name__, ()):
+        value = getattr(config, name)
+        if not low <= value <= high:
+            lines.append(f"{prefix}{name} is {value}; expected a value from {low} to {high}")
+    for item in fields(config):  # type: ignore[arg-type]
+        value = getattr(config, item.name)
+        if is_dataclass(value):
+            lines += problems(value, f"{prefix}{item.name}.")
+    return lines
+
+
+_ANY = float("inf")
+_RECIPE_RANGES = (("variants", 1, 1000),)
+# Class -> (field, smallest, largest value).
+_RANGES: dict[str, tuple[tuple[str, float, float], ...]] = {
+    "Recipe": _RECIPE_RANGES,
+    "AugmentConfig": _RECIPE_RANGES,
+    "EvaluateConfig": _RECIPE_RANGES,
+    "CameraConfig": (("horizontal_fov_deg", 5, 170), ("height_m", 0.01, 100), ("tilt_deg", 1, 90)),
+    "SceneConfig": (
+        ("static_gaussians", 100, 10_000_000),
+        ("moving_gaussians", 0, 10_000_000),
+        ("moving_frames", 1, 100_000),
+        ("moving_voxel_px", 0.05, 100),
+    ),
+    "MotionConfig": (("max_parts", 1, 64),),
+    "LossWeights": (("rgb", 0, _ANY), ("depth", 0, _ANY), ("mask", 0, _ANY)),
+    "LearningRates": tuple((name, 0, 1) for name in ("means", "log_scales", "quats", "opacity_logits", "colours")),
+    "FitConfig": (("steps", 0, 1_000_000), ("max_width", 16, 8192)),
+    "OrbitConfig": (("azimuth_deg", 0, 90), ("elevation_deg", 0, 60), ("translation_rel", 0, 1)),
+    "JitterConfig": (("translation_rel", 0, 1), ("rotation_deg", 0, 45)),
+}

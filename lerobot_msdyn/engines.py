@@ -1,0 +1,99 @@
+"""Who runs which episode: for now this process, one after the other."""
+
+import logging
+
+from lerobot.datasets import LeRobotDatasetMetadata
+from tqdm import tqdm
+from tqdm.contrib.logging import logging_redirect_tqdm
+
+from lerobot_msdyn.config import AugmentConfig
+from lerobot_msdyn.episode import depth_key_of
+from lerobot_msdyn.errors import ConfigError, EpisodeError
+from lerobot_msdyn.pipeline import augment_episode
+from lerobot_msdyn.write import NewEpisode, OutputDataset
+
+logger = logging.getLogger(__name__)
+
+
+def run_local(
+    source: LeRobotDatasetMetadata,
+    episodes: list[int],
+    cameras: list[str],
+    config: AugmentConfig,
+    output: OutputDataset,
+) -> tuple[list[NewEpisode], list[EpisodeError]]:
+    """All episodes in this process; an episode that cannot be read is reported and left out."""
+    if config.device == "cuda":
+        raise ConfigError("device is 'cuda', which this version cannot draw on; use --device cpu")
+    _say_what_is_assumed(source, cameras, config)
+    new: list[NewEpisode] = []
+    failures: list[EpisodeError] = []
+    bar_format = "{desc} |{bar}| {percentage:3.0f} % of {total} episodes [{elapsed}<{remaining}]"
+    with logging_redirect_tqdm(), tqdm(total=len(episodes), bar_format=bar_format) as bar:
+
+        def progress(what: str, share: float) -> None:
+            if what:
+                bar.set_description_str(what)
+            bar.update(share)
+
+        for done, index in enumerate(episodes, start=1):
+            try:
+                new += augment_episode(source, index, cameras, config, output, progress)
+            except EpisodeError as error:
+                logger.error("skipped: %s", error)
+                failures.append(error)
+            bar.update(done - bar.n)
+    return new, failures
+
+
+def plan(source: LeRobotDatasetMetadata, episodes: list[int], cameras: list[str], config: AugmentConfig) -> str:
+    """What a run would do: episodes, pictures, disk and a rough time."""
+    frames = sum(int(source.episodes[index]["length"]) for index in episodes)
+    copies = config.variants + int(config.include_source)
+    size = sum(file.stat().st_size for file in source.root.rglob("*") if file.is_file())
+    disk = size * frames * copies / max(source.total_frames, 1)
+    seconds = sum(
+        len(episodes) * config.fit.steps * _STEP_S_PER_GAUSSIAN * _gaussians(source, key, config)
+        + frames * config.variants * _pixels(source, key) * _FRAME_S_PER_PIXEL
+        for key in cameras
+    )
+    return (
+        f"{source.repo_id}: {len(episodes)} episodes, {frames} frames; re-rendering {', '.join(cameras)}\n"
+        f"{config.variants} new per episode: {len(episodes) * copies} episodes, {frames * copies} frames, "
+        f"{frames * config.variants * len(cameras)} new pictures\n"
+        f"about {disk / 1e6:.0f} MB on disk, and roughly {seconds / 60:.0f} minutes on two CPU cores\n"
+    )
+
+
+# Rough speeds of two CPU cores, for the estimate only.
+_STEP_S_PER_GAUSSIAN = 1e-5
+_FRAME_S_PER_PIXEL = 3e-6
+
+
+def _pixels(source: LeRobotDatasetMetadata, key: str) -> int:
+    height, width = source.features[key]["shape"][:2]
+    return int(height * width)
+
+
+def _gaussians(source: LeRobotDatasetMetadata, key: str, config: AugmentConfig) -> int:
+    scale = min(1.0, config.fit.max_width / source.features[key]["shape"][1])
+    static = min(_pixels(source, key) * scale**2, config.scene.static_gaussians)
+    return int(static) + config.scene.moving_gaussians
+
+
+def _say_what_is_assumed(source: LeRobotDatasetMetadata, cameras: list[str], config: AugmentConfig) -> None:
+    """Once per run: what nobody measured."""
+    logger.info("%s: re-rendering %s", source.repo_id, ", ".join(cameras))
+    if config.camera.calibration is None:
+        logger.warning(
+            "no calibration: cameras are taken as fixed, with a horizontal field of view of %g degrees "
+            "(--camera.calibration FILE, --camera.horizontal_fov_deg)",
+            config.camera.horizontal_fov_deg,
+        )
+    if config.priors.depth == "auto" and not all(depth_key_of(source, key) for key in cameras):
+        logger.warning(
+            "no recorded depth: scenes are built on a table plane seen from %g m at %g degrees "
+            "(--camera.height_m, --camera.tilt_deg); keep the changes of view small",
+            config.camera.height_m,
+            config.camera.tilt_deg,
+        )

@@ -1,0 +1,116 @@
+"""From priors to a scene: a static set from the empty scene, and a moving set gathered from several frames."""
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lerobot_msdyn.background import background_gaussians, fill_depth, pixel_gaussians
+from lerobot_msdyn.config import MotionConfig, SceneConfig
+from lerobot_msdyn.episode import View
+from lerobot_msdyn.geometry import invert_se3, matrix_to_quaternion, quaternion_multiply, se3
+from lerobot_msdyn.motion.bases import MotionLevel, identity_level, level_affines
+from lerobot_msdyn.motion.initialise import ObjectMotion, object_motion
+from lerobot_msdyn.priors import Priors
+from lerobot_msdyn.priors.depth import static_depth
+from lerobot_msdyn.scene import DynamicScene, Gaussians, concatenate
+
+MASK_BORDER_PX = 1  # pixels along the border of a mask mix two surfaces
+EDGE_JUMP = 0.03  # relative difference of neighbouring depths beyond which a pixel may lie between two surfaces
+
+
+def initialise(view: View, priors: Priors, scene: SceneConfig, motion: MotionConfig, seed: int) -> DynamicScene:
+    """A scene ready to be fitted.
+
+    Args:
+        view: the video, at the size at which it is fitted.
+        priors: its priors, at the same size.
+        scene: numbers of Gaussians.
+        motion: the levels of motion.
+        seed: of the choice among too many moving points.
+    """
+    background = static_depth(priors.depth, priors.instances)
+    static = background_gaussians(priors.median, background, view.camera, scene.static_gaussians)
+    frames = len(view.rgb)
+    objects = object_motion(priors.tracks, priors.depth, view.camera, motion.max_parts)
+    if objects is None or scene.moving_gaussians == 0:
+        none = torch.zeros(0, dtype=torch.long)
+        return _scene(static, static.select(none), none, identity_level(torch.zeros(1, 3), frames), frames)
+    moving, part = gather_moving(view, priors, objects, scene)
+    if len(moving) > scene.moving_gaussians:
+        generator = torch.Generator().manual_seed(seed)
+        chosen = torch.randperm(len(moving), generator=generator)[: scene.moving_gaussians].sort().values
+        moving, part = moving.select(chosen), part[chosen]
+    return _scene(static, moving, part, objects.level, frames)
+
+
+def gather_moving(
+    view: View, priors: Priors, objects: ObjectMotion, config: SceneConfig
+) -> tuple[Gaussians, Int[Tensor, " n"]]:
+    """Gaussians of everything that moves, in the canonical frame, and the part of which each is a piece.
+
+    Moving pixels of evenly spread frames are carried back by the motion of their part and merged in voxels of about a
+    pixel's size, so that what one frame hides is taken from another.
+    """
+    count = min(config.moving_frames, len(view.rgb))
+    gathered, parts = [], []
+    for frame in torch.linspace(0, len(view.rgb) - 1, count).round().long().unique().tolist():
+        inside = _certain(priors.instances[frame] > 0, priors.depth[frame]).reshape(-1)
+        if not bool(inside.any()):
+            continue
+        pixels, _ = pixel_gaussians(view.rgb[frame], fill_depth(priors.depth[frame]), view.camera, frame)
+        pixels = pixels.select(inside)
+        part = objects.assign(pixels.means, frame, priors.instances[frame].reshape(-1)[inside].long())
+        gathered.append(to_canonical(pixels, part, objects.level, frame))
+        parts.append(part)
+    if not gathered:
+        empty = pixel_gaussians(view.rgb[0], fill_depth(priors.depth[0]), view.camera, 0)[0]
+        return empty.select(torch.zeros(0, dtype=torch.long)), torch.zeros(0, dtype=torch.long)
+    depth = priors.depth[(priors.instances > 0) & (priors.depth > 0)]
+    voxel = config.moving_voxel_px * float(depth.median()) / float(view.camera.intrinsics[0, 0, 0])
+    return merge_voxels(concatenate(gathered), torch.cat(parts), voxel)
+
+
+def to_canonical(gaussians: Gaussians, part: Int[Tensor, " n"], level: MotionLevel, frame: int) -> Gaussians:
+    """Gaussians at a frame, carried back to the canonical frame by the motion of their part."""
+    affine = level_affines(level, torch.tensor([frame]))[:, 0]
+    back = invert_se3(se3(affine[:, :, :3], affine[:, :, 3]))[part]
+    turn = matrix_to_quaternion(back[:, :3, :3])
+    means = (back[:, :3, :3] @ gaussians.means[:, :, None])[..., 0] + back[:, :3, 3]
+    return Gaussians(
+        means, quaternion_multiply(turn, gaussians.quats), gaussians.log_scales, gaussians.opacity_logits, gaussians.sh
+    )
+
+
+def merge_voxels(gaussians: Gaussians, part: Int[Tensor, " n"], voxel: float) -> tuple[Gaussians, Int[Tensor, " m"]]:
+    """One Gaussian per occupied voxel (side in m) and part: mean position and colour, the first one's shape."""
+    cells = torch.cat(((gaussians.means / voxel).floor().long(), part[:, None]), dim=1)
+    _, group, count = torch.unique(cells, dim=0, return_inverse=True, return_counts=True)
+    first = torch.full((len(count),), len(group)).scatter_reduce(0, group, torch.arange(len(group)), "amin")
+
+    def mean(values: Float[Tensor, "n *_"]) -> Float[Tensor, "m *_"]:
+        total = torch.zeros(len(count), *values.shape[1:]).index_add_(0, group, values)
+        return total / count.reshape(-1, *[1] * (values.dim() - 1))
+
+    chosen = gaussians.select(first)
+    merged = Gaussians(
+        mean(gaussians.means), chosen.quats, chosen.log_scales, chosen.opacity_logits, mean(gaussians.sh)
+    )
+    return merged, part[first]
+
+
+def _certain(mask: Bool[Tensor, "h w"], depth: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+    """Pixels well inside a mask, of known depth, and not at a depth edge."""
+    window = np.ones((2 * MASK_BORDER_PX + 1,) * 2, np.uint8)
+    inside = cv2.erode(mask.numpy().astype(np.uint8), window, borderType=cv2.BORDER_REPLICATE) > 0
+    z = depth.numpy()
+    edge = cv2.dilate(z, window) > (1 + EDGE_JUMP) * cv2.erode(z, window)
+    return torch.from_numpy(inside & (z > 0) & ~edge)
+
+
+def _scene(
+    static: Gaussians, moving: Gaussians, part: Int[Tensor, " n"], level: MotionLevel, frames: int
+) -> DynamicScene:
+    """A scene with one level in which each moving Gaussian follows one basis."""
+    return DynamicScene(static, moving, (level,), (part[:, None],), (torch.zeros(len(part), 1),), frames)

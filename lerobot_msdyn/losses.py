@@ -1,0 +1,37 @@
+"""Loss terms of the fit: one small function each, unweighted; the weights are the recipe's."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+def rgb_loss(drawn: Float[Tensor, "b h w 3"], recorded: Float[Tensor, "b h w 3"]) -> Float[Tensor, ""]:
+    """Mean absolute difference of colours 0..1."""
+    return (drawn - recorded).abs().mean()
+
+
+def depth_loss(
+    drawn: Float[Tensor, "b h w"], known: Float[Tensor, "b h w"], alpha: Float[Tensor, "b h w"]
+) -> Float[Tensor, ""]:
+    """Mean absolute difference of inverse depth over its mean, where depth (m, 0 = unknown) is known and drawn."""
+    valid = (known > 0) & (alpha > 0.5) & (drawn > 0)
+    if not bool(valid.any()):
+        return drawn.sum() * 0
+    target = 1 / known[valid]
+    return (1 / drawn[valid] - target).abs().mean() / target.mean()
+
+
+def mask_loss(
+    drawn: Float[Tensor, "b h w"], moving: Bool[Tensor, "b h w"], certain: Bool[Tensor, "b h w"]
+) -> Float[Tensor, ""]:
+    """Mean absolute difference between the drawn share of moving Gaussians and the mask, where the mask is certain."""
+    return ((drawn - moving.float()).abs() * certain).sum() / certain.sum().clamp(min=1)
+
+
+def certain_pixels(moving: Bool[Tensor, "b h w"], band: int) -> Bool[Tensor, "b h w"]:
+    """Pixels further than `band` px from the border of a mask: there the mask can be trusted."""
+    inside = moving.float()[:, None]
+    size = 2 * band + 1
+    grown = torch.nn.functional.max_pool2d(inside, size, stride=1, padding=band)
+    shrunk = -torch.nn.functional.max_pool2d(-inside, size, stride=1, padding=band)
+    return ((grown == 0) | (shrunk == 1))[:, 0]

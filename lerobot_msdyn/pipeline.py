@@ -1,0 +1,121 @@
+"""The whole flow on one screen: an episode in, a scene per camera, new episodes out."""
+
+import logging
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from lerobot.datasets import LeRobotDatasetMetadata
+from torch import Tensor
+
+from lerobot_msdyn.cameras import CameraTrack
+from lerobot_msdyn.config import Recipe
+from lerobot_msdyn.episode import View, read_episode
+from lerobot_msdyn.fitting import FitResult, fit
+from lerobot_msdyn.initialisation import initialise
+from lerobot_msdyn.perturbation import draw_offset, draw_rng, look_at_distance, perturb
+from lerobot_msdyn.priors import Priors, estimate_priors
+from lerobot_msdyn.priors.depth import static_depth
+from lerobot_msdyn.provenance import SOURCE_VARIANT, Provenance
+from lerobot_msdyn.quality import fill_holes
+from lerobot_msdyn.rendering import render_frames, resized
+from lerobot_msdyn.write import NewEpisode, OutputDataset, to_uint8
+
+logger = logging.getLogger(__name__)
+
+Progress = Callable[[str, float], object]  # (what is being done, share of the episode done since the last call)
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """One camera's scene and what was known about its video."""
+
+    result: FitResult
+    priors: Priors
+    camera: CameraTrack  # at the size of the recorded video
+    distance: float  # m, to the look-at point
+
+
+def augment_episode(
+    source: LeRobotDatasetMetadata,
+    index: int,
+    cameras: list[str],
+    recipe: Recipe,
+    output: OutputDataset,
+    progress: Progress = lambda what, share: None,
+) -> list[NewEpisode]:
+    """All new episodes of one source episode, staged in the output.
+
+    Raises:
+        EpisodeError: the episode cannot be read.
+        PriorError: a prior was demanded and cannot be had.
+    """
+    episode = read_episode(source, index, cameras, recipe.camera, recorded_depth=recipe.priors.depth != "plane")
+    scenes = {}
+    for key, view in episode.views.items():
+        progress(f"episode {index}: fitting {key}", 0)
+        scenes[key] = reconstruct(view, recipe, lambda share: progress("", 0.5 * share / len(cameras)))
+    priors = {key: scene.priors.provenance for key, scene in scenes.items()}
+    new = []
+    if recipe.include_source:
+        new.append(NewEpisode(index, Provenance(source.repo_id, index, SOURCE_VARIANT, recipe.seed, {}, priors)))
+    for variant in range(recipe.variants):
+        progress(f"episode {index}: rendering variant {variant}", 0)
+        rng = draw_rng(recipe.seed, index, variant)
+        pictures, drawn = {}, {}
+        for key, scene in scenes.items():
+            offset, drawn[key] = draw_offset(recipe.perturbation, scene.distance, rng)
+            pictures[key] = new_pictures(scene, perturb(scene.camera, offset))
+        provenance = Provenance(source.repo_id, index, variant, recipe.seed, drawn, priors)
+        new.append(output.stage(index, variant, pictures, provenance))
+        progress("", 0.5 / recipe.variants)
+    return new
+
+
+def reconstruct(view: View, recipe: Recipe, progress: Callable[[float], object] = lambda share: None) -> Reconstruction:
+    """Priors, initial scene and fit of one camera's video."""
+    camera = view.camera
+    view = shrink(view, recipe.fit.max_width)
+    priors = estimate_priors(view, recipe.priors, recipe.camera)
+    distance = look_at_distance(static_depth(priors.depth, priors.instances))
+    scene = initialise(view, priors, recipe.scene, recipe.motion, recipe.seed)
+    result = fit(
+        scene,
+        view,
+        priors,
+        recipe.fit,
+        distance=distance,
+        seed=recipe.seed,
+        progress=lambda steps: progress(steps / recipe.fit.steps),
+    )
+    return Reconstruction(result, priors, camera, distance)
+
+
+def new_pictures(
+    scene: Reconstruction, camera: CameraTrack, frames: Tensor | None = None
+) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+    """The scene's frames through another camera, holes filled; the share of holes is logged at the end."""
+    holes = []
+    for rendering in render_frames(scene.result.scene, camera, frames):
+        for rgb, alpha in zip(to_uint8(rendering.rgb), rendering.alpha.cpu().numpy(), strict=True):
+            picture, share = fill_holes(rgb, alpha)
+            holes.append(share)
+            yield picture
+    logger.info("%.1f %% of the pixels were filled in (worst frame %.1f %%)", 100 * np.mean(holes), 100 * max(holes))
+
+
+def shrink(view: View, max_width: int) -> View:
+    """The same video with at most `max_width` columns; depth keeps its values (nearest pixel)."""
+    height, width = view.rgb.shape[1:3]
+    if width <= max_width:
+        return view
+    size = (max_width, round(height * max_width / width))
+    rgb = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in view.rgb.numpy()])
+    depth: Float[Tensor, "t h w"] | None = None
+    if view.depth is not None:
+        images = [cv2.resize(image, size, interpolation=cv2.INTER_NEAREST) for image in view.depth.numpy()]
+        depth = torch.from_numpy(np.stack(images))
+    return View(torch.from_numpy(rgb), resized(view.camera, *size), depth, view.depth_range)

@@ -1,0 +1,57 @@
+"""Pictures of a dynamic scene: frames from a camera track."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lerobot_msdyn.cameras import CameraTrack
+from lerobot_msdyn.render import Raster, rasterize
+from lerobot_msdyn.scene import DynamicScene
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What a camera sees of a scene."""
+
+    rgb: Float[Tensor, "t h w 3"]  # 0..1, over black
+    depth: Float[Tensor, "t h w"]  # m, expected z-depth; 0 where nothing is
+    alpha: Float[Tensor, "t h w"]  # 0..1
+    moving: Float[Tensor, "t h w"]  # 0..1, share of the moving set
+
+
+def draw(scene: DynamicScene, camera: CameraTrack, frames: Tensor, backend: str = "auto") -> Rendering:
+    """The scene at `frames` (int, [b]) through the b poses of `camera`; differentiable."""
+    snapshot = scene.at(frames)
+    raster: Raster = rasterize(
+        snapshot.means,
+        snapshot.quats,
+        snapshot.scales,
+        snapshot.opacities,
+        torch.cat((snapshot.rgb, snapshot.moving[:, None]), dim=-1),
+        camera.camera_from_world,
+        camera.intrinsics,
+        camera.width,
+        camera.height,
+        backend=backend,
+    )
+    return Rendering(raster.features[..., :3], raster.depth, raster.alpha, raster.features[..., 3])
+
+
+@torch.no_grad()
+def render_frames(
+    scene: DynamicScene, camera: CameraTrack, frames: Tensor | None = None, *, batch: int = 8, backend: str = "auto"
+) -> Iterator[Rendering]:
+    """The whole scene in batches of frames, so that memory stays bounded; `frames` (int, [t]) defaults to all."""
+    frames = torch.arange(scene.frames) if frames is None else frames
+    for start in range(0, len(frames), batch):
+        part = slice(start, min(start + batch, len(frames)))
+        yield draw(scene, camera.select(part), frames[part], backend)
+
+
+def resized(camera: CameraTrack, width: int, height: int) -> CameraTrack:
+    """The same camera with another number of pixels."""
+    scale = torch.tensor([[width / camera.width], [height / camera.height], [1.0]], device=camera.intrinsics.device)
+    return replace(camera, intrinsics=camera.intrinsics * scale, width=width, height=height)

@@ -1,0 +1,153 @@
+"""Gaussians, and a scene of a static and a moving set; saved as safetensors with a schema version."""
+
+import json
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, Int
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from lerobot_msdyn.errors import MsdynError
+from lerobot_msdyn.motion.bases import MotionLevel
+from lerobot_msdyn.motion.compose import compose
+
+SCHEMA_VERSION = 1
+SH_C0 = 0.28209479177387814  # the constant spherical harmonic
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """A set of anisotropic Gaussians; colours as spherical harmonics (3DGS, Kerbl et al. 2023)."""
+
+    means: Float[Tensor, "g 3"]  # m
+    quats: Float[Tensor, "g 4"]  # wxyz, of any non-zero length
+    log_scales: Float[Tensor, "g 3"]  # log of standard deviations in m
+    opacity_logits: Float[Tensor, " g"]
+    sh: Float[Tensor, "g k 3"]
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def rgb(self) -> Float[Tensor, "g 3"]:
+        """Colours 0..1 (degree 0)."""
+        return (self.sh[:, 0] * SH_C0 + 0.5).clamp(min=0)
+
+    def select(self, which: Tensor) -> "Gaussians":
+        """Some of the Gaussians, by index or mask."""
+        return Gaussians(**{item.name: getattr(self, item.name)[which] for item in fields(self)})
+
+    def to(self, device: torch.device | str) -> "Gaussians":
+        """The same set on a device."""
+        return Gaussians(**{item.name: getattr(self, item.name).to(device) for item in fields(self)})
+
+
+def concatenate(parts: list[Gaussians]) -> Gaussians:
+    """One set of several."""
+    return Gaussians(**{item.name: torch.cat([getattr(p, item.name) for p in parts]) for item in fields(Gaussians)})
+
+
+def gaussians_from_points(
+    means: Float[Tensor, "g 3"],
+    quats: Float[Tensor, "g 4"],
+    scales: Float[Tensor, "g 3"],
+    rgb: Float[Tensor, "g 3"],
+    opacity: float,
+) -> Gaussians:
+    """Gaussians of given linear scales (m), colours 0..1 and one common opacity."""
+    logit = torch.logit(torch.tensor(opacity))
+    return Gaussians(
+        means=means.contiguous(),
+        quats=quats.contiguous(),
+        log_scales=scales.clamp(min=1e-6).log(),
+        opacity_logits=logit.expand(len(means)).clone(),
+        sh=((rgb - 0.5) / SH_C0)[:, None].contiguous(),
+    )
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """All Gaussians of a scene at some frames, ready to be rasterized: the static ones first."""
+
+    means: Float[Tensor, "b g 3"]
+    quats: Float[Tensor, "b g 4"]
+    scales: Float[Tensor, "g 3"]
+    opacities: Float[Tensor, " g"]
+    rgb: Float[Tensor, "g 3"]
+    moving: Float[Tensor, " g"]  # 1 for the moving set, 0 for the static one
+
+
+@dataclass(frozen=True)
+class DynamicScene:
+    """A static set, a moving set in its canonical frame, and the levels of motion that carry it (docs/method.md)."""
+
+    static: Gaussians
+    moving: Gaussians
+    levels: tuple[MotionLevel, ...]  # coarse to fine
+    indices: tuple[Int[Tensor, "n k"], ...]  # per level: the bases that move each Gaussian
+    logits: tuple[Float[Tensor, "n k"], ...]  # per level: their weights before the softmax
+    frames: int
+
+    def at(self, frames: Int[Tensor, " b"]) -> Snapshot:
+        """The scene at some frames, differentiable in all Gaussians and bases."""
+        static, moving = self.static, self.moving
+        means, quats = compose(moving.means, moving.quats, self.levels, self.indices, self.logits, frames)
+        b = len(frames)
+        return Snapshot(
+            means=torch.cat((static.means.expand(b, -1, -1), means), dim=1),
+            quats=torch.cat((static.quats.expand(b, -1, -1), quats), dim=1),
+            scales=torch.cat((static.log_scales, moving.log_scales)).exp(),
+            opacities=torch.cat((static.opacity_logits, moving.opacity_logits)).sigmoid(),
+            rgb=torch.cat((static.rgb, moving.rgb)),
+            moving=torch.cat((torch.zeros_like(static.opacity_logits), torch.ones_like(moving.opacity_logits))),
+        )
+
+
+def save_scene(scene: DynamicScene, path: Path) -> None:
+    """Write a scene as one safetensors file, atomically."""
+    tensors: dict[str, Tensor] = {}
+    for name, part in (("static", scene.static), ("moving", scene.moving)):
+        tensors |= {f"{name}.{item.name}": getattr(part, item.name) for item in fields(part)}
+    for i, level in enumerate(scene.levels):
+        tensors |= {f"levels.{i}.{item.name}": getattr(level, item.name) for item in fields(level)}
+        tensors |= {f"levels.{i}.indices": scene.indices[i], f"levels.{i}.logits": scene.logits[i]}
+    header = {"schema": SCHEMA_VERSION, "levels": len(scene.levels), "frames": scene.frames}
+    partial = path.with_name(path.name + ".partial")
+    save_file(
+        {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()},
+        partial,
+        metadata={"lerobot_msdyn": json.dumps(header)},
+    )
+    partial.replace(path)
+
+
+def load_scene(path: Path) -> DynamicScene:
+    """Read a scene that `save_scene` wrote.
+
+    Raises:
+        MsdynError: the file is absent, damaged, or of another schema.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = json.loads((file.metadata() or {}).get("lerobot_msdyn", "{}"))
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (OSError, ValueError, SafetensorError) as error:
+        raise MsdynError(f"{path}: not a readable scene file ({error})") from error
+    if header.get("schema") != SCHEMA_VERSION:
+        raise MsdynError(f"{path}: scene schema is {header.get('schema')}; expected {SCHEMA_VERSION}; fit it again")
+    levels = range(header["levels"])
+
+    def part(name: str, kind: type) -> dict[str, Tensor]:
+        return {item.name: tensors[f"{name}.{item.name}"] for item in fields(kind)}
+
+    return DynamicScene(
+        static=Gaussians(**part("static", Gaussians)),
+        moving=Gaussians(**part("moving", Gaussians)),
+        levels=tuple(MotionLevel(**part(f"levels.{i}", MotionLevel)) for i in levels),
+        indices=tuple(tensors[f"levels.{i}.indices"] for i in levels),
+        logits=tuple(tensors[f"levels.{i}.logits"] for i in levels),
+        frames=header["frames"],
+    )

@@ -1,0 +1,45 @@
+"""Small made-up datasets that several tests share; nothing is downloaded."""
+
+import logging
+import os
+from pathlib import Path
+
+import pytest
+
+os.environ.setdefault("HF_HUB_OFFLINE", "1")
+
+from lerobot_msdyn.synthetic import make_scene
+from lerobot_msdyn.synthetic.dataset import write_dataset
+
+logging.getLogger("lerobot").setLevel(logging.WARNING)
+
+FRAMES, WIDTH, HEIGHT = 12, 64, 48
+
+
+def _scenes(episodes: int) -> list:
+    return [make_scene("push", 0, FRAMES, WIDTH, HEIGHT, episode=index) for index in range(episodes)]
+
+
+@pytest.fixture(scope="session")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three episodes that share one mp4 per camera: front and side, with recorded depth."""
+    root = tmp_path_factory.mktemp("desk") / "desk"
+    write_dataset(_scenes(3), "local/desk", root, cameras=["front", "side"], depth=True)
+    return root
+
+
+@pytest.fixture(scope="session")
+def image_desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two episodes whose pictures are image features, inside the parquet files."""
+    root = tmp_path_factory.mktemp("image_desk") / "desk"
+    write_dataset(_scenes(2), "local/desk", root, cameras=["front", "wrist"], image_dtype="image")
+    return root
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Recorded episodes beside the checkout, where there are any."""
+    path = Path(__file__).parent.parent.parent / "shared" / "data"
+    if not path.is_dir():
+        pytest.skip("no recorded episodes beside the checkout")
+    return path
