@@ -1,0 +1,87 @@
+"""Scenes: what they hold at a time, saved and loaded."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from lerobot_msdyn.errors import MsdynError
+from lerobot_msdyn.geometry import axis_angle_to_matrix, se3
+from lerobot_msdyn.motion.bases import level_from_motions
+from lerobot_msdyn.scene import DynamicScene, Gaussians, concatenate, gaussians_from_points, load_scene, save_scene
+
+
+def some_gaussians(count: int, seed: int = 0) -> Gaussians:
+    generator = torch.Generator().manual_seed(seed)
+    return gaussians_from_points(
+        torch.randn(count, 3, generator=generator),
+        torch.randn(count, 4, generator=generator),
+        torch.rand(count, 3, generator=generator) + 0.1,
+        torch.rand(count, 3, generator=generator),
+        0.7,
+    )
+
+
+def scene_with_two_parts() -> DynamicScene:
+    """The second part shifts by 1 m along x at frame 1 and turns a quarter about z at frame 2."""
+    motions = torch.eye(4).repeat(2, 3, 1, 1)
+    motions[1, 1, 0, 3] = 1.0
+    motions[1, 2] = se3(axis_angle_to_matrix(torch.tensor([0.0, 0.0, torch.pi / 2])), torch.zeros(3))
+    level = level_from_motions(motions, torch.zeros(2, 3))
+    part = torch.tensor([0, 1, 1])
+    return DynamicScene(
+        some_gaussians(2), some_gaussians(3, 1), (level,), (part[:, None],), (torch.zeros(3, 1),), frames=3
+    )
+
+
+def test_points_become_gaussians() -> None:
+    gaussians = gaussians_from_points(
+        torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.02), torch.tensor([[0.1, 0.5, 0.9]]), 0.7
+    )
+    torch.testing.assert_close(gaussians.log_scales.exp(), torch.full((1, 3), 0.02))
+    torch.testing.assert_close(gaussians.opacity_logits.sigmoid(), torch.tensor([0.7]))
+    torch.testing.assert_close(gaussians.rgb, torch.tensor([[0.1, 0.5, 0.9]]))
+
+
+def test_static_stays_and_moving_follows_its_part() -> None:
+    scene = scene_with_two_parts()
+    snapshot = scene.at(torch.tensor([0, 1, 2]))
+    still, moving = snapshot.means[:, :2], snapshot.means[:, 2:]
+    torch.testing.assert_close(still, scene.static.means.expand(3, -1, -1))
+    torch.testing.assert_close(moving[:, 0], scene.moving.means[0].expand(3, -1))
+    torch.testing.assert_close(moving[0], scene.moving.means)
+    torch.testing.assert_close(moving[1, 1:], scene.moving.means[1:] + torch.tensor([1.0, 0, 0]))
+    x, y, z = scene.moving.means[1:].unbind(-1)
+    torch.testing.assert_close(moving[2, 1:], torch.stack((-y, x, z), dim=-1), atol=1e-6, rtol=0)
+    assert snapshot.moving.tolist() == [0, 0, 1, 1, 1]
+
+
+def test_select_and_concatenate_undo_each_other() -> None:
+    gaussians = some_gaussians(5)
+    parts = [gaussians.select(torch.tensor([0, 1])), gaussians.select(torch.tensor([2, 3, 4]))]
+    torch.testing.assert_close(concatenate(parts).means, gaussians.means)
+    torch.testing.assert_close(concatenate(parts).sh, gaussians.sh)
+
+
+def test_a_saved_scene_comes_back(tmp_path: Path) -> None:
+    scene = scene_with_two_parts()
+    save_scene(scene, tmp_path / "scene.safetensors")
+    again = load_scene(tmp_path / "scene.safetensors")
+    frames = torch.arange(3)
+    for name in ("means", "quats", "scales", "opacities", "rgb", "moving"):
+        assert torch.equal(getattr(scene.at(frames), name), getattr(again.at(frames), name))
+    assert again.frames == 3
+    assert [path.name for path in tmp_path.iterdir()] == ["scene.safetensors"]
+
+
+def test_what_is_no_scene_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "scene.safetensors"
+    with pytest.raises(MsdynError, match="not a readable scene file"):
+        load_scene(path)
+    path.write_bytes(b"nothing")
+    with pytest.raises(MsdynError, match="not a readable scene file"):
+        load_scene(path)
+    save_file({"a": torch.zeros(1)}, path, metadata={"lerobot_msdyn": '{"schema": 99}'})
+    with pytest.raises(MsdynError, match="scene schema is 99; expected 1"):
+        load_scene(path)
