@@ -31,7 +31,7 @@ def initialise(view: View, priors: Priors, scene: SceneConfig, motion: MotionCon
         seed: of the choice among too many moving points.
     """
     background = static_depth(priors.depth, priors.instances)
-    static = background_gaussians(priors.median, background, view.camera, scene.static_gaussians)
+    static = background_gaussians(priors.empty, background, view.camera, scene.static_gaussians)
     frames = len(view.rgb)
     objects = object_motion(priors.tracks, priors.depth, view.camera, motion.max_parts)
     if objects is None or scene.moving_gaussians == 0:

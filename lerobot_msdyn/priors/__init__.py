@@ -12,7 +12,7 @@ from lerobot_msdyn.config import CameraConfig, PriorsConfig
 from lerobot_msdyn.episode import View
 from lerobot_msdyn.errors import PriorError
 from lerobot_msdyn.priors.depth import align_disparity, clean_recorded_depth, table_plane_depth
-from lerobot_msdyn.priors.masks import moving_instances, temporal_median
+from lerobot_msdyn.priors.masks import empty_scene, moving_instances, temporal_median
 from lerobot_msdyn.priors.tracks import flow_tracks
 from lerobot_msdyn.priors.types import PointTracks, Priors
 
@@ -30,6 +30,7 @@ def estimate_priors(view: View, config: PriorsConfig, camera: CameraConfig) -> P
     median, noise = temporal_median(view.rgb)
     instances = moving_instances(view.rgb, median, noise)
     depth, metric, why = _depth(view, instances, config.depth, camera)
+    empty = empty_scene(view.rgb, instances, median)
     tracks = flow_tracks(view.rgb, instances)
     found = int(instances.max())
     provenance = {
@@ -39,7 +40,7 @@ def estimate_priors(view: View, config: PriorsConfig, camera: CameraConfig) -> P
     }
     for prior, line in provenance.items():
         logger.info("%s: %s", prior, line)
-    return Priors(depth, instances, median, tracks, metric, provenance)
+    return Priors(depth, instances, empty, tracks, metric, provenance)
 
 
 def _depth(

@@ -1,0 +1,148 @@
+"""From tracks to the object level of motion: lift, choose a canonical frame, split into rigid parts, fit each."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lerobot_msdyn.cameras import CameraTrack
+from lerobot_msdyn.geometry import invert_se3, transform_points
+from lerobot_msdyn.motion.bases import MotionLevel, level_affines, level_from_motions
+from lerobot_msdyn.motion.lift import lift_tracks
+from lerobot_msdyn.motion.parts import split_rigid_parts
+from lerobot_msdyn.motion.rigid import fill_gaps, fit_rigid, model_points
+from lerobot_msdyn.priors.types import PointTracks
+
+_MIN_SEEN = 3  # frames, and 5 % of the clip, in which a track must be seen
+_MIN_SEEN_SHARE = 0.05
+_VOTERS = 5  # tracks that decide the part of a point
+_CHUNK = 4096  # points whose distances to all tracks are held at a time
+
+
+@dataclass(frozen=True)
+class ObjectMotion:
+    """The object level: one rigid motion per part, and the tracks by which points find their part."""
+
+    level: MotionLevel
+    canonical_frame: int
+    points: Float[Tensor, "n 3"]  # m, tracked points at the canonical frame
+    part: Int[Tensor, " n"]  # index of the basis that each follows
+    instance: Int[Tensor, " n"]
+
+    def assign(
+        self, points: Float[Tensor, "m 3"], frame: int, instance: Int[Tensor, " m"]
+    ) -> Int[Tensor, " m"]:
+        """Part of world points (m) seen at a frame: that of most of the five nearest tracks of the same instance.
+
+        All tracks take part, where their part has carried them, whether or not they are seen at that frame. Points
+        of an instance without tracks go by the nearest tracks of any.
+        """
+        affine = level_affines(self.level, torch.tensor([frame]))[self.part, 0]
+        moved = (affine[:, :, :3] @ self.points[:, :, None])[..., 0] + affine[:, :, 3]
+        out = torch.zeros(len(points), dtype=torch.long)
+        for label in instance.unique():
+            rows = (instance == label).nonzero()[:, 0]
+            tracks = (self.instance == label).nonzero()[:, 0]
+            if len(tracks) == 0:
+                tracks = torch.arange(len(self.points))
+            for some in rows.split(_CHUNK):
+                out[some] = self._vote(points[some], moved[tracks], self.part[tracks])
+        return out
+
+    def _vote(
+        self, points: Float[Tensor, "m 3"], tracked: Float[Tensor, "n 3"], part: Int[Tensor, " n"]
+    ) -> Int[Tensor, " m"]:
+        distance, nearest = torch.cdist(points, tracked).topk(min(_VOTERS, len(tracked)), largest=False)
+        votes = torch.zeros(len(points), len(self.level))
+        return votes.scatter_add_(1, part[nearest], 1 / distance.clamp(min=1e-6)).argmax(dim=1)
+
+
+def object_motion(
+    tracks: PointTracks, depth: Float[Tensor, "t h w"], camera: CameraTrack, max_parts: int
+) -> ObjectMotion | None:
+    """Motion of everything that was tracked, or None where nothing was.
+
+    Args:
+        tracks: points followed in the image.
+        depth: z-depth in m, 0 = unknown.
+        camera: the camera that saw both.
+        max_parts: bound on the rigid parts of one instance.
+    """
+    xyz, valid = lift_tracks(tracks, depth, camera)
+    kept = valid.sum(1) >= max(_MIN_SEEN, _MIN_SEEN_SHARE * valid.shape[1])
+    if not kept.any():
+        return None
+    xyz, valid = xyz[kept], valid[kept]
+    confidence, instance = tracks.confidence[kept], tracks.instance[kept]
+    canonical = canonical_frame(valid, instance)
+    part = split_rigid_parts(xyz, valid, confidence, instance, max_parts)
+    level, points = initialise_objects(xyz, valid, confidence, part, canonical)
+    return ObjectMotion(level, canonical, points, part, instance)
+
+
+def canonical_frame(valid: Bool[Tensor, "n t"], instance: Int[Tensor, " n"]) -> int:
+    """The frame in which the instances are seen best, each by its own measure, so that none yields to a larger one.
+
+    Ties go to the frame with more tracks, then to the one nearest the middle of the clip.
+    """
+    frames = valid.shape[1]
+    share = torch.zeros(frames, dtype=torch.float64)
+    for label in instance.unique():
+        seen = valid[instance == label].sum(0).double()
+        share += seen / seen.max().clamp(min=1)
+    total = valid.sum(0).double()
+    middle = (torch.arange(frames) - (frames - 1) / 2).abs()
+    ranking = sorted(range(frames), key=lambda t: (-round(share[t].item(), 9), -total[t].item(), middle[t].item()))
+    return ranking[0]
+
+
+def initialise_objects(
+    xyz: Float[Tensor, "n t 3"],
+    valid: Bool[Tensor, "n t"],
+    confidence: Float[Tensor, "n t"],
+    part: Int[Tensor, " n"],
+    canonical: int,
+) -> tuple[MotionLevel, Float[Tensor, "n 3"]]:
+    """One basis per part, the identity at the canonical frame, and every track's point (m) at that frame.
+
+    Frames in which too few tracks support a part are bridged by interpolation, and held beyond its first and last
+    sight. A part that is never supported stands still.
+    """
+    count = int(part.max()) + 1 if len(part) else 0
+    frames = xyz.shape[1]
+    motions = torch.eye(4).repeat(count, frames, 1, 1)
+    pivots, points = torch.zeros(count, 3), torch.zeros(len(xyz), 3)
+    for k in range(count):
+        rows = part == k
+        weights = torch.where(valid, confidence.square(), 0.0)[rows]
+        motion, canonical_points = _part_motion(xyz[rows], weights, canonical)
+        motions[k] = motion.float()
+        points[rows] = canonical_points.float()
+        pivots[k] = points[rows].mean(0)
+    return level_from_motions(motions, pivots), points
+
+
+def _part_motion(
+    xyz: Float[Tensor, "n t 3"], weights: Float[Tensor, "n t"], canonical: int
+) -> tuple[Float[Tensor, "t 4 4"], Float[Tensor, "n 3"]]:
+    fit = fit_rigid(xyz, weights[None])
+    points, known = model_points(xyz, weights, fit)
+    accepted = fit.support[0] > 0
+    if not (accepted.any() and known.any()):
+        mean = (weights[..., None] * xyz).sum(1) / weights.sum(1, keepdim=True).clamp(min=1e-12)
+        return torch.eye(4).repeat(xyz.shape[1], 1, 1), mean
+    pivot = points[0, known[0]].mean(0)
+    motions = fill_gaps(fit.motions[0], accepted, pivot)
+    # tracks that the part never met while it was supported are put where they were seen, carried back
+    last_resort = _carried_back(xyz.double(), weights.double(), motions)
+    placed = torch.where(known[0][:, None], points[0], last_resort)
+    at_canonical = motions[canonical]
+    return motions @ invert_se3(at_canonical), transform_points(at_canonical, placed)
+
+
+def _carried_back(
+    xyz: Float[Tensor, "n t 3"], weights: Float[Tensor, "n t"], motions: Float[Tensor, "t 4 4"]
+) -> Float[Tensor, "n 3"]:
+    back = transform_points(invert_se3(motions), xyz.transpose(0, 1))
+    return torch.einsum("nt,tnc->nc", weights, back) / weights.sum(1, keepdim=True).clamp(min=1e-12)

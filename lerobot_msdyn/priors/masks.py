@@ -1,0 +1,234 @@
+"""What moves, without learned weights: difference to the temporal median, corrected by a vote of point tracks.
+
+The median alone goes wrong where an object rests for most of the clip: it is in the median, so it is missed while it
+rests, and the place that it leaves shows up as moving afterwards. Tracks settle such places: a point that is ever
+carried along belongs to an object at all times; a point that stays put, or whose place looks as before once the
+thing that seemed to carry it has passed, is background.
+
+Limits: what never moves in the clip is background, even a part of a thing that does (a robot's base, the resting half
+of a cloth); something that comes to rest where no track can follow it there stays in the median if it rests long;
+strong shadows on textured ground are partly taken for objects.
+"""
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Int, UInt8
+from numpy import ndarray
+from torch import Tensor
+
+from lerobot_msdyn.priors.change import changes, to_lab
+from lerobot_msdyn.priors.tracks import flow_tracks
+from lerobot_msdyn.priors.types import PointTracks
+
+MAX_INSTANCES = 8
+_MEDIAN_SAMPLES = 60  # frames over which medians are taken
+_NOISE_FLOOR = 1.0  # CIE Lab units
+_TRACK_RESTART = 10  # frames, of the tracks that vote
+_MOVED_PX = 2.0  # a track that strays farther than this from its median position is carried by something
+_MIN_REST_FRAMES = 8  # a track has a home if it stays within half of that for so long
+_MIN_RETURN_FRAMES = 3  # and its home is background if it looks the same so often while the track is away ...
+_SAME_GREY = 8.0  # ... up to this mean difference of grey levels
+_HOME_PATCH = 7  # px
+_TRUSTED_FRAMES = 20  # a track's vote grows with its life up to this
+_VOTE_SIGMA_PX = 3.0  # how far a track's vote reaches
+_MIN_VOTE = 0.2  # of one track at the pixel itself
+_MIN_EMPTY_FRAMES = 5  # seen empty so often, a pixel's background is known
+_MIN_AREA = 5e-4  # of the image; smaller blobs are dropped
+_MIN_LIFE = 5  # frames; instances seen in fewer are dropped
+
+
+def temporal_median(rgb: UInt8[Tensor, "t h w 3"]) -> tuple[UInt8[Tensor, "h w 3"], Float32[Tensor, "h w"]]:
+    """Median colour of every pixel, and its usual distance from it (CIE Lab units, with a floor).
+
+    Over at most 60 evenly spread frames.
+    """
+    sample = _spread(len(rgb))
+    frames = rgb.cpu().numpy()[sample]
+    median = np.median(frames, axis=0).astype(np.uint8)
+    reference = to_lab(median)
+    distance = np.stack([np.linalg.norm(to_lab(frame) - reference, axis=-1) for frame in frames])
+    noise = np.median(distance, axis=0).clip(min=_NOISE_FLOOR).astype(np.float32)
+    return torch.from_numpy(median), torch.from_numpy(noise)
+
+
+def empty_scene(
+    rgb: UInt8[Tensor, "t h w 3"], instances: UInt8[Tensor, "t h w"], median: UInt8[Tensor, "h w 3"]
+) -> UInt8[Tensor, "h w 3"]:
+    """The temporal median over frames in which nothing moves at the pixel; the plain `median` where there is none."""
+    mask = instances.cpu().numpy() > 0
+    around = np.stack([cv2.dilate(m.astype(np.uint8), np.ones((5, 5), np.uint8)) for m in mask])
+    return torch.from_numpy(_median_where(rgb.cpu().numpy(), around == 0, median.cpu().numpy()))
+
+
+def moving_instances(
+    rgb: UInt8[Tensor, "t h w 3"], median: UInt8[Tensor, "h w 3"], noise: Float32[Tensor, "h w"]
+) -> UInt8[Tensor, "t h w"]:
+    """Instance of every pixel: 0 = static, 1, 2, ... = things that move at some time of the clip, largest first.
+
+    At most 8 instances, each followed by optical flow so that it keeps its number when it touches another. `median`
+    and `noise` are those of `temporal_median`.
+    """
+    frames = rgb.cpu().numpy()
+    moving = _moving_pixels(frames, median.cpu().numpy(), noise.cpu().numpy())
+    return torch.from_numpy(_number(_linked(frames, moving)))
+
+
+def _spread(frames: int) -> Int[ndarray, " s"]:
+    return np.linspace(0, frames - 1, min(frames, _MEDIAN_SAMPLES)).round().astype(int)
+
+
+def _moving_pixels(
+    frames: UInt8[ndarray, "t h w 3"], median: UInt8[ndarray, "h w 3"], noise: Float32[ndarray, "h w"]
+) -> Bool[ndarray, "t h w"]:
+    """Pixels that show something that moves at some time of the clip, even while it rests."""
+    region = _ever_changing(changes(frames, median, noise))
+    if not region.any():
+        return np.zeros(frames.shape[:3], bool)
+    everywhere = torch.from_numpy(region.astype(np.uint8)).expand(len(frames), -1, -1).contiguous()
+    tracks = flow_tracks(torch.from_numpy(frames), everywhere, restart_every=_TRACK_RESTART)
+    for_moving, for_empty = _vote(tracks, frames)
+    audible = _MIN_VOTE / (2 * np.pi * _VOTE_SIGMA_PX**2)
+    empty = ~region | ((for_empty > 2 * for_moving) & (for_empty > audible))
+    known = empty.sum(0) >= _MIN_EMPTY_FRAMES
+    background = _median_where(frames, empty, median)
+    voted = (for_moving > for_empty) & (for_moving > audible)
+    moving = np.where(known, changes(frames, background, noise), voted) & region
+    return np.stack([_tidy(mask) for mask in moving])
+
+
+def _ever_changing(changed: Bool[ndarray, "t h w"]) -> Bool[ndarray, "h w"]:
+    """Everything that changes at some time, without gaps and with a margin."""
+    ever = cv2.morphologyEx((changed.sum(0) >= 2).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    ever = cv2.morphologyEx(ever, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8))
+    outlines, _ = cv2.findContours(ever, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    filled = cv2.drawContours(ever.copy(), outlines, -1, 1, cv2.FILLED)
+    return cv2.dilate(filled, np.ones((9, 9), np.uint8)) > 0
+
+
+def _tidy(mask: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
+    """Without specks, gaps and small blobs."""
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
+    tidy = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, kernel)
+    tidy = cv2.morphologyEx(tidy, cv2.MORPH_CLOSE, kernel, iterations=2)
+    _, components, stats, _ = cv2.connectedComponentsWithStats(tidy, connectivity=8)
+    large = stats[:, cv2.CC_STAT_AREA] >= _MIN_AREA * mask.size
+    large[0] = False
+    return large[components]
+
+
+def _vote(
+    tracks: PointTracks, frames: UInt8[ndarray, "t h w 3"]
+) -> tuple[Float32[ndarray, "t h w"], Float32[ndarray, "t h w"]]:
+    """For every pixel, how strongly the tracks near it speak for something that moves, and for the background."""
+    xy, visible = tracks.xy.numpy(), tracks.visible.numpy()
+    seen = np.where(visible[..., None], xy, np.nan)
+    home = np.nanmedian(seen, axis=1) if len(xy) else np.zeros((0, 2), np.float32)
+    away = np.where(visible, np.linalg.norm(xy - home[:, None], axis=-1), np.inf)
+    at_home = away < 0.5 * _MOVED_PX
+    strays = (visible & (away > _MOVED_PX)).sum(1) > 0.05 * visible.sum(1)
+    rests = at_home.sum(1) >= _MIN_REST_FRAMES
+    dragged = strays & rests & _looks_the_same(frames, home, at_home, away > _MOVED_PX)
+    weight = np.minimum(visible.sum(1) / _TRUSTED_FRAMES, 1)[:, None]
+    for_moving = weight * (visible & (strays & ~dragged)[:, None])
+    for_empty = weight * (at_home & (~strays | dragged)[:, None])
+    return _density(xy, for_moving, frames.shape[1:3]), _density(xy, for_empty, frames.shape[1:3])
+
+
+def _looks_the_same(
+    frames: UInt8[ndarray, "t h w 3"],
+    home: Float32[ndarray, "n 2"],
+    at_home: Bool[ndarray, "n t"],
+    gone: Bool[ndarray, "n t"],
+) -> Bool[ndarray, " n"]:
+    """Whether a track's home shows what it rested on while the track is elsewhere: then nothing was carried away."""
+    images = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY).astype(np.float32) for frame in frames]
+    patch = np.zeros((len(home), _HOME_PATCH**2), np.float32)
+    for t, image in enumerate(images):
+        patch[at_home[:, t]] += _patches(image, home[at_home[:, t]])
+    patch /= np.maximum(at_home.sum(1), 1)[:, None]
+    times = np.zeros(len(home), int)
+    for t, image in enumerate(images):
+        rows = np.nonzero(gone[:, t])[0]
+        times[rows] += np.abs(_patches(image, home[rows]) - patch[rows]).mean(1) < _SAME_GREY
+    return times >= _MIN_RETURN_FRAMES
+
+
+def _patches(image: Float32[ndarray, "h w"], xy: Float32[ndarray, "n 2"]) -> Float32[ndarray, "n p"]:
+    offset = np.arange(_HOME_PATCH, dtype=np.float32) - _HOME_PATCH // 2
+    dy, dx = np.meshgrid(offset, offset, indexing="ij")
+    x, y = (xy.astype(np.float32) - 0.5).T
+    at = x[:, None] + dx.reshape(1, -1), y[:, None] + dy.reshape(1, -1)
+    return cv2.remap(image, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).reshape(len(xy), -1)
+
+
+def _density(
+    xy: Float32[ndarray, "n t 2"], weight: ndarray, shape: tuple[int, int]
+) -> Float32[ndarray, "t h w"]:
+    """Weighted number of points per pixel, blurred to the reach of a vote."""
+    out = np.zeros((xy.shape[1], *shape), np.float32)
+    for t, image in enumerate(out):
+        rows = np.nonzero(weight[:, t])[0]
+        column, row = xy[rows, t].astype(int).T
+        np.add.at(image, (row.clip(0, shape[0] - 1), column.clip(0, shape[1] - 1)), weight[rows, t])
+        out[t] = cv2.GaussianBlur(image, (0, 0), _VOTE_SIGMA_PX)
+    return out
+
+
+def _median_where(
+    frames: UInt8[ndarray, "t h w 3"], usable: Bool[ndarray, "t h w"], otherwise: UInt8[ndarray, "h w 3"]
+) -> UInt8[ndarray, "h w 3"]:
+    """Median colour of every pixel over the frames in which it is usable, or `otherwise`."""
+    out = otherwise.copy()
+    sample = _spread(len(frames))
+    partly = usable[sample].any(0) & ~usable[sample].all(0)
+    values = np.where(usable[sample][:, partly, None], frames[sample][:, partly], np.float32(np.nan))
+    out[partly] = np.nanmedian(values, axis=0).round().astype(np.uint8) if partly.any() else out[partly]
+    return out
+
+
+def _linked(frames: UInt8[ndarray, "t h w 3"], moving: Bool[ndarray, "t h w"]) -> Int[ndarray, "t h w"]:
+    """A number per moving thing, carried from frame to frame by optical flow; what flow does not reach is new."""
+    dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+    grey = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in frames]
+    y, x = np.mgrid[: grey[0].shape[0], : grey[0].shape[1]].astype(np.float32)
+    labels = np.zeros(moving.shape, np.int32)
+    used = 0
+    for t, mask in enumerate(moving):
+        carried = np.zeros_like(labels[0])
+        if t > 0 and labels[t - 1].any():
+            flow = dis.calc(grey[t], grey[t - 1], None)
+            before = labels[t - 1].astype(np.float32)
+            carried = cv2.remap(before, x + flow[..., 0], y + flow[..., 1], cv2.INTER_NEAREST).astype(np.int32)
+        count, components = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
+        for component in range(1, count):
+            inside = components == component
+            known = carried * inside
+            if known.any():
+                labels[t][inside] = _nearest(known)[inside]
+            else:
+                used += 1
+                labels[t][inside] = used
+    return labels
+
+
+def _nearest(labels: Int[ndarray, "h w"]) -> Int[ndarray, "h w"]:
+    """Every pixel with the label of the nearest labelled one."""
+    _, index = cv2.distanceTransformWithLabels(
+        (labels == 0).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    lookup = np.zeros(index.max() + 1, labels.dtype)
+    lookup[index[labels > 0]] = labels[labels > 0]
+    return lookup[index]
+
+
+def _number(labels: Int[ndarray, "t h w"]) -> UInt8[ndarray, "t h w"]:
+    """The largest things as 1, 2, ...; what is small or short-lived is dropped."""
+    area = np.stack([np.bincount(frame.ravel(), minlength=labels.max() + 1) for frame in labels])
+    area[:, 0] = 0
+    life = (area > 0).sum(0)
+    lasting = (life >= min(_MIN_LIFE, len(labels))) & (area.sum(0) >= _MIN_AREA * labels[0].size * np.maximum(life, 1))
+    order = np.argsort(-area.sum(0) * lasting, kind="stable")[: min(MAX_INSTANCES, int(lasting.sum()))]
+    lookup = np.zeros(labels.max() + 1, np.uint8)
+    lookup[order] = np.arange(1, len(order) + 1)
+    return lookup[labels]

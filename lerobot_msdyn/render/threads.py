@@ -1,0 +1,38 @@
+"""Runs one kernel on several threads at once.
+
+Kernels release the GIL and take their work by tickets from a shared counter, so a plain Python thread pool drives
+them. numba's own threading layers were not used: `omp` kills forked children (DataLoader workers), `workqueue`
+aborts the process when two Python threads enter it, `tbb` is one more thing to install; and all three are
+process-wide choices that a library should leave to its user. The number of threads is torch's (1 inside DataLoader
+workers).
+"""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any
+
+import numpy as np
+import torch
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    """Threads that help the calling one; each is started when it is first needed."""
+    return ThreadPoolExecutor(max(1, (os.cpu_count() or 1) - 1), "rasterizer")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # a forked child has none of its parent's threads
+
+
+def run(kernel: Callable[..., None], items: int, *arguments: Any) -> None:
+    """Call `kernel(tickets, *arguments)` on as many threads as torch uses and `items` tickets can feed."""
+    tickets = np.zeros(1, np.int64)
+    helpers = min(torch.get_num_threads(), items) - 1
+    futures = [_pool().submit(kernel, tickets, *arguments) for _ in range(helpers)]
+    kernel(tickets, *arguments)
+    for future in futures:
+        if not future.cancel():  # one that never started has nothing left to do
+            future.result()

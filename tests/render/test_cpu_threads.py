@@ -1,0 +1,89 @@
+"""The CPU rasterizer gives the same bits on any number of threads, in workers and from several threads at once."""
+
+import threading
+
+import pytest
+import torch
+from torch.utils.data import DataLoader, Dataset
+
+from lerobot_msdyn.render import rasterize
+
+
+@pytest.fixture
+def restore_threads():
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+def images_and_gradients(scene):
+    raster, leaves = scene.draw("cpu")
+    (raster.features.square().sum() + raster.depth.sum() + raster.alpha.sin().sum()).backward()
+    return [raster.features.detach(), raster.depth.detach(), raster.alpha.detach(), *(leaf.grad for leaf in leaves)]
+
+
+def test_bits_do_not_depend_on_the_number_of_threads(make_scene, restore_threads):
+    scene = make_scene(count=3000, width=200, height=140, views=2, channels=8)
+    torch.set_num_threads(1)
+    expected = images_and_gradients(scene)
+    for threads in (2, 3, 7):
+        torch.set_num_threads(threads)
+        for _ in range(3):
+            got = images_and_gradients(scene)
+            assert all(torch.equal(a, b) for a, b in zip(got, expected, strict=True))
+
+
+def test_two_python_threads_at_once(make_scene):
+    scenes = [make_scene(count=1500, seed=seed) for seed in range(2)]
+    expected = [images_and_gradients(scene) for scene in scenes]
+    failures = []
+
+    def work(index):
+        for _ in range(10):
+            got = images_and_gradients(scenes[index])
+            if not all(torch.equal(a, b) for a, b in zip(got, expected[index], strict=True)):
+                failures.append(index)
+
+    threads = [threading.Thread(target=work, args=(index,)) for index in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(timeout=60)
+        assert not thread.is_alive()
+    assert failures == []
+
+
+class _Renders(Dataset):
+    """Item i is the image of a Gaussian at i / 10 m to the right, and the gradient of its mean."""
+
+    def __len__(self):
+        return 4
+
+    def __getitem__(self, index):
+        means = torch.tensor([[index / 10, 0.0, 2.0]], requires_grad=True)
+        raster = rasterize(
+            means,
+            torch.tensor([[1.0, 0, 0, 0]]),
+            torch.full((1, 3), 0.2),
+            torch.tensor([0.7]),
+            torch.ones(1, 3),
+            torch.eye(4)[None],
+            torch.tensor([[60.0, 0, 40], [0, 60, 35], [0, 0, 1]])[None],
+            80,
+            70,
+            backend="cpu",
+        )
+        raster.features.square().sum().backward()
+        return raster.features.detach()[0], means.grad
+
+
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded, use of fork:DeprecationWarning")
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_data_loader_workers(method):
+    data = _Renders()
+    expected = [data[index] for index in range(len(data))]  # the parent has used its threads
+    workers = 2 if method == "fork" else 1  # a spawned worker imports everything anew
+    loader = DataLoader(data, batch_size=None, num_workers=workers, multiprocessing_context=method, timeout=120)
+    for got, want in zip(loader, expected, strict=True):
+        assert torch.equal(got[0], want[0])
+        assert torch.equal(got[1], want[1])
