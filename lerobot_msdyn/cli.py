@@ -126,6 +126,8 @@ def run_command(main: Callable[[list[str]], int], arguments: list[str] | None = 
     Exit codes: 0 all done, 1 some episodes failed, 2 bad input, 130 interrupted.
     """
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s", stream=sys.stderr)
+    for name in ("lerobot", "httpx"):
+        logging.getLogger(name).setLevel(logging.WARNING)
     try:
         code = main(sys.argv[1:] if arguments is None else arguments)
     except MsdynError as error:

@@ -1,5 +1,8 @@
 """From priors to a scene: a static set from the empty scene, and a moving set gathered from several frames."""
 
+import math
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import torch
@@ -17,10 +20,11 @@ from lerobot_msdyn.priors.depth import static_depth
 from lerobot_msdyn.scene import DynamicScene, Gaussians, concatenate
 
 MASK_BORDER_PX = 1  # pixels along the border of a mask mix two surfaces
+VOXEL_GROWTH = 1.15  # of the voxels' side, until there are few enough
 EDGE_JUMP = 0.03  # relative difference of neighbouring depths beyond which a pixel may lie between two surfaces
 
 
-def initialise(view: View, priors: Priors, scene: SceneConfig, motion: MotionConfig, seed: int) -> DynamicScene:
+def initialise(view: View, priors: Priors, scene: SceneConfig, motion: MotionConfig) -> DynamicScene:
     """A scene ready to be fitted.
 
     Args:
@@ -28,7 +32,6 @@ def initialise(view: View, priors: Priors, scene: SceneConfig, motion: MotionCon
         priors: its priors, at the same size.
         scene: numbers of Gaussians.
         motion: the levels of motion.
-        seed: of the choice among too many moving points.
     """
     background = static_depth(priors.depth, priors.instances)
     static = background_gaussians(priors.empty, background, view.camera, scene.static_gaussians)
@@ -38,10 +41,6 @@ def initialise(view: View, priors: Priors, scene: SceneConfig, motion: MotionCon
         none = torch.zeros(0, dtype=torch.long)
         return _scene(static, static.select(none), none, identity_level(torch.zeros(1, 3), frames), frames)
     moving, part = gather_moving(view, priors, objects, scene)
-    if len(moving) > scene.moving_gaussians:
-        generator = torch.Generator().manual_seed(seed)
-        chosen = torch.randperm(len(moving), generator=generator)[: scene.moving_gaussians].sort().values
-        moving, part = moving.select(chosen), part[chosen]
     return _scene(static, moving, part, objects.level, frames)
 
 
@@ -51,7 +50,7 @@ def gather_moving(
     """Gaussians of everything that moves, in the canonical frame, and the part of which each is a piece.
 
     Moving pixels of evenly spread frames are carried back by the motion of their part and merged in voxels of about a
-    pixel's size, so that what one frame hides is taken from another.
+    pixel's size, so that what one frame hides is taken from another. Larger voxels are used where these are too many.
     """
     count = min(config.moving_frames, len(view.rgb))
     gathered, parts = [], []
@@ -69,7 +68,14 @@ def gather_moving(
         return empty.select(torch.zeros(0, dtype=torch.long)), torch.zeros(0, dtype=torch.long)
     depth = priors.depth[(priors.instances > 0) & (priors.depth > 0)]
     voxel = config.moving_voxel_px * float(depth.median()) / float(view.camera.intrinsics[0, 0, 0])
-    return merge_voxels(concatenate(gathered), torch.cat(parts), voxel)
+    points, part = concatenate(gathered), torch.cat(parts)
+    growth = 1.0
+    merged = merge_voxels(points, part, voxel)
+    while len(merged[0]) > config.moving_gaussians:
+        growth *= VOXEL_GROWTH
+        merged = merge_voxels(points, part, growth * voxel)
+    moving, part = merged
+    return replace(moving, log_scales=moving.log_scales + math.log(growth)), part
 
 
 def to_canonical(gaussians: Gaussians, part: Int[Tensor, " n"], level: MotionLevel, frame: int) -> Gaussians:

@@ -1,5 +1,6 @@
 """The whole flow on one screen: an episode in, a scene per camera, new episodes out."""
 
+import contextlib
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -79,9 +80,10 @@ def reconstruct(view: View, recipe: Recipe, progress: Callable[[float], object] 
     """Priors, initial scene and fit of one camera's video."""
     camera = view.camera
     view = shrink(view, recipe.fit.max_width)
-    priors = estimate_priors(view, recipe.priors, recipe.camera)
-    distance = look_at_distance(static_depth(priors.depth, priors.instances))
-    scene = initialise(view, priors, recipe.scene, recipe.motion, recipe.seed)
+    with _one_torch_thread():
+        priors = estimate_priors(view, recipe.priors, recipe.camera)
+        distance = look_at_distance(static_depth(priors.depth, priors.instances))
+        scene = initialise(view, priors, recipe.scene, recipe.motion)
     result = fit(
         scene,
         view,
@@ -92,6 +94,17 @@ def reconstruct(view: View, recipe: Recipe, progress: Callable[[float], object] 
         progress=lambda steps: progress(steps / recipe.fit.steps),
     )
     return Reconstruction(result, priors, camera, distance)
+
+
+@contextlib.contextmanager
+def _one_torch_thread() -> Iterator[None]:
+    """Thousands of small solves are several times slower when torch spreads each over all cores."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def new_pictures(

@@ -16,7 +16,9 @@ from lerobot.datasets.video_utils import decode_video_frames, get_video_duration
 from lerobot_msdyn.episode import TIMESTAMP_TOLERANCE_S, VIDEO_BACKEND
 from lerobot_msdyn.errors import EpisodeError, OutputError
 
-os.environ.setdefault("SVT_LOG", "1")  # the AV1 encoder writes to stderr past every logger; 1 = errors only
+# FFmpeg and the AV1 encoder write to stderr past every logger: errors only.
+av.logging.set_libav_level(av.logging.ERROR)
+os.environ.setdefault("SVT_LOG", "1")
 
 
 def encoder_of(feature: dict, key: str) -> RGBEncoderConfig | DepthEncoderConfig:

@@ -30,9 +30,7 @@ class ObjectMotion:
     part: Int[Tensor, " n"]  # index of the basis that each follows
     instance: Int[Tensor, " n"]
 
-    def assign(
-        self, points: Float[Tensor, "m 3"], frame: int, instance: Int[Tensor, " m"]
-    ) -> Int[Tensor, " m"]:
+    def assign(self, points: Float[Tensor, "m 3"], frame: int, instance: Int[Tensor, " m"]) -> Int[Tensor, " m"]:
         """Part of world points (m) seen at a frame: that of most of the five nearest tracks of the same instance.
 
         All tracks take part, where their part has carried them, whether or not they are seen at that frame. Points

@@ -42,7 +42,7 @@ def lift_tracks(
 
 
 def position_noise(xyz: Float[Tensor, "n t 3"], valid: Bool[Tensor, "n t"]) -> float:
-    """Standard deviation (m) of lifted positions along one axis, from second differences of steady tracks; 0 if none."""
+    """Standard deviation (m) of lifted positions along one axis, from second differences over time; 0 if none."""
     triple = valid[:, :-2] & valid[:, 1:-1] & valid[:, 2:]
     second = (xyz[:, :-2] - 2 * xyz[:, 1:-1] + xyz[:, 2:])[triple]
     if len(second) == 0:
@@ -56,7 +56,7 @@ def _near_edge(depth: np.ndarray) -> np.ndarray:
     window = np.ones((3, 3), np.uint8)
     far = cv2.dilate(np.where(known, depth, 0).astype(np.float32), window)
     near = cv2.erode(np.where(known, depth, np.inf).astype(np.float32), window)
-    edge = (far > (1 + _EDGE_JUMP) * near).astype(np.uint8)
+    edge = (far / (1 + _EDGE_JUMP) > near).astype(np.uint8)
     side = 2 * _EDGE_MARGIN_PX - 1  # the window above reaches one pixel already
     return cv2.dilate(edge, np.ones((side, side), np.uint8)) > 0
 

@@ -134,9 +134,7 @@ def _typical_residuals(tracks: _Tracks, fits: RigidFit) -> Float[Tensor, "h n"]:
     return torch.where(covered > 0.5 * tracks.weights.sum(-1), square.sqrt(), torch.inf)
 
 
-def _costs(
-    tracks: _Tracks, fits: RigidFit, tolerance: float, *, only_covered: bool = False
-) -> Float[Tensor, "h n"]:
+def _costs(tracks: _Tracks, fits: RigidFit, tolerance: float, *, only_covered: bool = False) -> Float[Tensor, "h n"]:
     """Mean squared residual of every track under every motion, in tolerances and at most 1.
 
     A frame to which the motion does not extend costs 1; with `only_covered` such frames are left out, but a track needs

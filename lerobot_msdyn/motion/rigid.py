@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch import Tensor
 
@@ -16,7 +16,7 @@ from lerobot_msdyn.geometry import (
 )
 
 MIN_EFFECTIVE = 5.0  # tracks that a frame needs for its motion to be accepted: (sum w)² / sum w²
-_IRLS_STEPS = 4
+_IRLS_STEPS = 5
 _NORMAL_MAD = 1.4826  # standard deviations in the median absolute deviation of a normal distribution
 _NOISE_FLOOR = 1e-4  # of the group's extent: the smallest scale of the robust weights
 _MODEL_MEMORY = 10  # observations that a model point averages while the clip is swept
@@ -85,9 +85,7 @@ def model_points(
     return torch.einsum("htn,htnc->hnc", weight.to(back), back) / total.clamp(min=1e-12)[..., None], total > 1e-9
 
 
-def residuals(
-    xyz: Float[Tensor, "n t 3"], points: Float[Tensor, "h n 3"], fit: RigidFit
-) -> Float[Tensor, "h n t"]:
+def residuals(xyz: Float[Tensor, "n t 3"], points: Float[Tensor, "h n 3"], fit: RigidFit) -> Float[Tensor, "h n t"]:
     """Distance (m) of every track from where each group's motion puts it."""
     moved = transform_points(fit.motions, points[:, None].expand(-1, fit.motions.shape[1], -1, -1))
     return (moved - xyz.transpose(0, 1)).norm(dim=-1).transpose(1, 2)
@@ -133,7 +131,8 @@ def _sweep(xyz: Float[Tensor, "n t 3"], weights: Float[Tensor, "h n t"], min_eff
             at = frame[rows]
             target = xyz[:, at].transpose(0, 1)
             seen = weights[rows, :, at]
-            motion, effective = _register(model[rows], target, seen * (count[rows] > 0), floor[rows])
+            usable = seen * (count[rows] > 0)
+            motion, effective = _register(model[rows], target, usable, floor[rows], last[rows])
             accepted = effective >= min_effective
             last[rows] = torch.where(accepted[:, None, None], motion, last[rows])
             motions[rows, at] = last[rows]
@@ -150,14 +149,18 @@ def _register(
     target: Float[Tensor, "h n 3"],
     weights: Float[Tensor, "h n"],
     floor: Float[Tensor, " h"],
+    motion: Float[Tensor, "h 4 4"],
 ) -> tuple[Float[Tensor, "h 4 4"], Float[Tensor, " h"]]:
-    """Robust rigid motions and the effective number of points behind each."""
+    """Robust rigid motions, starting from a guess, and the effective number of points behind each.
+
+    The guess is that of the neighbouring frame: what follows the body is near it, what does not need not be.
+    """
     robust = weights
     for _ in range(_IRLS_STEPS):
-        motion = weighted_procrustes(source, target, robust)
         distance = (transform_points(motion, source) - target).norm(dim=-1)
         robust = _robust_weights(distance, weights, floor)
-    return weighted_procrustes(source, target, robust), _effective(robust)
+        motion = weighted_procrustes(source, target, robust)
+    return motion, _effective(robust)
 
 
 def _robust_weights(

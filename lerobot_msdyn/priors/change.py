@@ -24,9 +24,9 @@ def changes(
 ) -> Bool[ndarray, "t h w"]:
     """Pixels of each frame that show something else than the reference does.
 
-    Hysteresis on the distance in CIE Lab, in units of the pixel's own noise: a connected region counts as changed if some
-    of it surely is. Shadows and moderate changes of brightness do not count; a black or grey thing on a plain darker
-    or brighter ground can be taken for one.
+    Hysteresis on the distance in CIE Lab, in units of the pixel's own noise: a connected region counts as changed if
+    some of it surely is. Shadows and moderate changes of brightness do not count; a black or grey thing on a plain
+    darker or brighter ground can be taken for one.
     """
     lab = to_lab(reference)
     scale = np.minimum(noise, _NOISE_CEILING * np.median(noise))

@@ -2,7 +2,6 @@
 
 import math
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -18,9 +17,7 @@ _ALIGN_SAMPLES = 20_000  # pixels of a clip that an alignment looks at
 _ALIGN_STEPS = 20
 
 
-def clean_recorded_depth(
-    depth: Float[Tensor, "t h w"], depth_min: float, depth_max: float
-) -> Float[Tensor, "t h w"]:
+def clean_recorded_depth(depth: Float[Tensor, "t h w"], depth_min: float, depth_max: float) -> Float[Tensor, "t h w"]:
     """Recorded z-depth (m) with everything that is no measurement set to 0.
 
     LeRobot stores depth in a bounded range: a missing pixel comes back as `depth_min` and a far one as `depth_max`
@@ -96,9 +93,7 @@ def _static_median(depth: Float[Tensor, "t p"], instances: UInt8[Tensor, "t p"])
     return torch.where(usable, depth, torch.nan).nanmedian(dim=0).values.nan_to_num(0.0)
 
 
-def align_disparity(
-    disparity: Float[Tensor, "t h w"], reference: Float[Tensor, "t h w"]
-) -> Float[Tensor, "t h w"]:
+def align_disparity(disparity: Float[Tensor, "t h w"], reference: Float[Tensor, "t h w"]) -> Float[Tensor, "t h w"]:
     """Depth (m) of relative inverse depth, by one robust scale and shift per clip against a reference depth (m).
 
     Least absolute differences of inverse depth, by iterated reweighting. Depth is bounded by twice the reference's

@@ -2,8 +2,8 @@
 
 The median alone goes wrong where an object rests for most of the clip: it is in the median, so it is missed while it
 rests, and the place that it leaves shows up as moving afterwards. Tracks settle such places: a point that is ever
-carried along belongs to an object at all times; a point that stays put, or whose place looks as before once the
-thing that seemed to carry it has passed, is background.
+carried along, looking the same, belongs to an object at all times; a point that stays put, or whose place looks as
+before once the thing that seemed to carry it has passed, is background.
 
 Limits: what never moves in the clip is background, even a part of a thing that does (a robot's base, the resting half
 of a cloth); something that comes to rest where no track can follow it there stays in the median if it rests long;
@@ -27,14 +27,17 @@ _NOISE_FLOOR = 1.0  # CIE Lab units
 _TRACK_RESTART = 10  # frames, of the tracks that vote
 _MOVED_PX = 2.0  # a track that strays farther than this from its median position is carried by something
 _MIN_REST_FRAMES = 8  # a track has a home if it stays within half of that for so long
-_MIN_RETURN_FRAMES = 3  # and its home is background if it looks the same so often while the track is away ...
-_SAME_GREY = 8.0  # ... up to this mean difference of grey levels
+_MIN_ALIKE_FRAMES = 3  # it was not carried if, while it strays, its home looks as before, or itself does not, so often
+_SAME_TEXTURE = 8.0  # mean difference of grey levels, apart from brightness, up to which two patches look alike
+_SAME_BRIGHTNESS = 8.0  # difference of mean grey levels that is allowed at the same place ...
+_CARRIED_BRIGHTNESS = 30.0  # ... and on a surface that may have turned in the light
 _HOME_PATCH = 7  # px
 _TRUSTED_FRAMES = 20  # a track's vote grows with its life up to this
 _VOTE_SIGMA_PX = 3.0  # how far a track's vote reaches
 _MIN_VOTE = 0.2  # of one track at the pixel itself
 _MIN_EMPTY_FRAMES = 5  # seen empty so often, a pixel's background is known
 _MIN_AREA = 5e-4  # of the image; smaller blobs are dropped
+_MIN_INSTANCE_AREA = 1e-3  # of the image, while it is seen; smaller instances are dropped
 _MIN_LIFE = 5  # frames; instances seen in fewer are dropped
 
 
@@ -128,30 +131,43 @@ def _vote(
     at_home = away < 0.5 * _MOVED_PX
     strays = (visible & (away > _MOVED_PX)).sum(1) > 0.05 * visible.sum(1)
     rests = at_home.sum(1) >= _MIN_REST_FRAMES
-    dragged = strays & rests & _looks_the_same(frames, home, at_home, away > _MOVED_PX)
+    elsewhere = away > _MOVED_PX
+    images = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY).astype(np.float32) for frame in frames]
+    patch = _rest_patches(images, home, at_home)
+    returns = _times_alike(images, np.broadcast_to(home[:, None], xy.shape), patch, elsewhere, _SAME_BRIGHTNESS)
+    carried = _times_alike(images, xy, patch, elsewhere & visible, _CARRIED_BRIGHTNESS)
+    dragged = strays & rests & ((returns >= _MIN_ALIKE_FRAMES) | (carried < _MIN_ALIKE_FRAMES))
     weight = np.minimum(visible.sum(1) / _TRUSTED_FRAMES, 1)[:, None]
     for_moving = weight * (visible & (strays & ~dragged)[:, None])
     for_empty = weight * (at_home & (~strays | dragged)[:, None])
     return _density(xy, for_moving, frames.shape[1:3]), _density(xy, for_empty, frames.shape[1:3])
 
 
-def _looks_the_same(
-    frames: UInt8[ndarray, "t h w 3"],
-    home: Float32[ndarray, "n 2"],
-    at_home: Bool[ndarray, "n t"],
-    gone: Bool[ndarray, "n t"],
-) -> Bool[ndarray, " n"]:
-    """Whether a track's home shows what it rested on while the track is elsewhere: then nothing was carried away."""
-    images = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY).astype(np.float32) for frame in frames]
+def _rest_patches(
+    images: list[ndarray], home: Float32[ndarray, "n 2"], at_home: Bool[ndarray, "n t"]
+) -> Float32[ndarray, "n p"]:
+    """What each track rests on."""
     patch = np.zeros((len(home), _HOME_PATCH**2), np.float32)
     for t, image in enumerate(images):
         patch[at_home[:, t]] += _patches(image, home[at_home[:, t]])
-    patch /= np.maximum(at_home.sum(1), 1)[:, None]
-    times = np.zeros(len(home), int)
+    return patch / np.maximum(at_home.sum(1), 1)[:, None].astype(np.float32)
+
+
+def _times_alike(
+    images: list[ndarray],
+    xy: Float32[ndarray, "n t 2"],
+    patch: Float32[ndarray, "n p"],
+    when: Bool[ndarray, "n t"],
+    brightness: float,
+) -> Int[ndarray, " n"]:
+    """In how many of some frames the picture at some positions looks like a patch, up to some change of brightness."""
+    times = np.zeros(len(patch), int)
     for t, image in enumerate(images):
-        rows = np.nonzero(gone[:, t])[0]
-        times[rows] += np.abs(_patches(image, home[rows]) - patch[rows]).mean(1) < _SAME_GREY
-    return times >= _MIN_RETURN_FRAMES
+        rows = np.nonzero(when[:, t])[0]
+        difference = _patches(image, xy[rows, t]) - patch[rows]
+        offset = difference.mean(1, keepdims=True)
+        times[rows] += (np.abs(difference - offset).mean(1) < _SAME_TEXTURE) & (np.abs(offset[:, 0]) < brightness)
+    return times
 
 
 def _patches(image: Float32[ndarray, "h w"], xy: Float32[ndarray, "n 2"]) -> Float32[ndarray, "n p"]:
@@ -162,9 +178,7 @@ def _patches(image: Float32[ndarray, "h w"], xy: Float32[ndarray, "n 2"]) -> Flo
     return cv2.remap(image, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).reshape(len(xy), -1)
 
 
-def _density(
-    xy: Float32[ndarray, "n t 2"], weight: ndarray, shape: tuple[int, int]
-) -> Float32[ndarray, "t h w"]:
+def _density(xy: Float32[ndarray, "n t 2"], weight: ndarray, shape: tuple[int, int]) -> Float32[ndarray, "t h w"]:
     """Weighted number of points per pixel, blurred to the reach of a vote."""
     out = np.zeros((xy.shape[1], *shape), np.float32)
     for t, image in enumerate(out):
@@ -189,7 +203,7 @@ def _median_where(
 
 def _linked(frames: UInt8[ndarray, "t h w 3"], moving: Bool[ndarray, "t h w"]) -> Int[ndarray, "t h w"]:
     """A number per moving thing, carried from frame to frame by optical flow; what flow does not reach is new."""
-    dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
     grey = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in frames]
     y, x = np.mgrid[: grey[0].shape[0], : grey[0].shape[1]].astype(np.float32)
     labels = np.zeros(moving.shape, np.int32)
@@ -227,7 +241,9 @@ def _number(labels: Int[ndarray, "t h w"]) -> UInt8[ndarray, "t h w"]:
     area = np.stack([np.bincount(frame.ravel(), minlength=labels.max() + 1) for frame in labels])
     area[:, 0] = 0
     life = (area > 0).sum(0)
-    lasting = (life >= min(_MIN_LIFE, len(labels))) & (area.sum(0) >= _MIN_AREA * labels[0].size * np.maximum(life, 1))
+    lasting = (life >= min(_MIN_LIFE, len(labels))) & (
+        area.sum(0) >= _MIN_INSTANCE_AREA * labels[0].size * np.maximum(life, 1)
+    )
     order = np.argsort(-area.sum(0) * lasting, kind="stable")[: min(MAX_INSTANCES, int(lasting.sum()))]
     lookup = np.zeros(labels.max() + 1, np.uint8)
     lookup[order] = np.arange(1, len(order) + 1)

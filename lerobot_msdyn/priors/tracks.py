@@ -1,10 +1,12 @@
 """Point tracks without learned weights: chained optical flow, re-registered to the patch that each track began with.
 
-Flow between neighbouring frames (DIS, Kroeger et al. 2016) carries a point; Lucas-Kanade registration to an older
-frame, the track's anchor, takes out the drift; forward-backward flow and the correlation with the anchor's patch
-decide whether the point is seen.
+Flow between neighbouring frames (DIS, Kroeger et al. 2016) carries a point; Lucas-Kanade registration to the patch
+about it in an older frame, its anchor, takes out the drift; forward-backward flow and the correlation with the
+anchor's patch decide whether the point is seen. Only the part of a patch that lies on the point's own instance counts:
+what is behind an edge moves differently.
 """
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -15,27 +17,25 @@ from jaxtyping import Bool, Float32, Int, UInt8
 from numpy import ndarray
 from torch import Tensor
 
+from lerobot_msdyn.priors.patches import Patches, cut, register, sample
 from lerobot_msdyn.priors.types import PointTracks
 
 _POINTS_PER_INSTANCE = 400  # at a time; instances too small for that get a finer grid, down to 2 px
 _EDGE_MARGIN_PX = 2  # of the first points of a track from the edge of their instance ...
 _SMALL_INSTANCE_PX = 1000  # ... and half of that in instances smaller than this
-_PATCH = 9  # px, side of the patch that is compared with the anchor's
-_LK_WINDOW = (11, 11)
-_LK_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
-_MAX_POLISH_PX = 2.0  # a registration that leads farther than this from where flow put the point has slipped
+_SMOOTH_WINDOW = 9  # px, over which an instance's flow is averaged for the second guess
 _STALE_NCC = 0.8  # below this the anchor no longer looks like the point: take a newer one ...
 _MIN_ANCHOR_AGE = 4  # ... unless it is younger than this, in frames
 _FOUND_NCC = 0.85  # an occluded point counts as seen again, at the place where it was lost, above this
 _MAX_GAP = 45  # frames for which an occluded point is looked for
-_NOISE_VARIANCE = 4.0  # grey levels², of a compressed video; keeps flat patches from correlating by their noise
 
 
 @dataclass(frozen=True)
 class _Video:
-    """Grey frames at working size and the flow between neighbours."""
+    """Grey frames at working size, their instances, and the flow between neighbours."""
 
-    grey: list[UInt8[ndarray, "h w"]]
+    grey: list[Float32[ndarray, "h w"]]
+    labels: UInt8[ndarray, "t h w"]
     forward: list[ndarray]  # [h,w,2] px, frame t -> t+1; float16 so that the flow of a clip fits in memory
     backward: list[ndarray]  # frame t+1 -> t
 
@@ -45,6 +45,10 @@ class _Video:
         pair = min(source, target)
         return there[pair].astype(np.float32), back[pair].astype(np.float32)
 
+    def patches(self, frame: int, xy: Float32[ndarray, "n 2"]) -> Patches:
+        """Patches about some points, with the weight of what lies on each point's own instance."""
+        return cut(self.grey[frame], self.labels[frame], xy)
+
 
 @dataclass
 class _Points:
@@ -53,19 +57,28 @@ class _Points:
     xy: Float32[ndarray, "n 2"]  # where it is, or was last seen
     confidence: Float32[ndarray, " n"]  # 0 = not seen at this frame
     lost_for: Int[ndarray, " n"]  # frames since it was last seen
-    anchor: Int[ndarray, " n"]  # frame whose patch the point is registered to
-    anchor_xy: Float32[ndarray, "n 2"]
-
-    @classmethod
-    def start(cls, xy: Float32[ndarray, "n 2"], frame: int) -> "_Points":
-        n = len(xy)
-        return cls(xy, np.ones(n, np.float32), np.zeros(n, int), np.full(n, frame), xy.copy())
+    anchored: Int[ndarray, " n"]  # frame of the anchor
+    anchor: Patches
 
     def joined(self, other: "_Points") -> "_Points":
-        return _Points(*(np.concatenate(pair) for pair in zip(vars(self).values(), vars(other).values(), strict=True)))
+        """Both sets, this one first."""
+        return _Points(
+            np.concatenate((self.xy, other.xy)),
+            np.concatenate((self.confidence, other.confidence)),
+            np.concatenate((self.lost_for, other.lost_for)),
+            np.concatenate((self.anchored, other.anchored)),
+            self.anchor.joined(other.anchor),
+        )
 
     def rows(self, index: ndarray) -> "_Points":
-        return _Points(*(value[index] for value in vars(self).values()))
+        """Some of the points, copied."""
+        return _Points(
+            self.xy[index],
+            self.confidence[index],
+            self.lost_for[index],
+            self.anchored[index],
+            self.anchor.rows(index),
+        )
 
 
 def flow_tracks(
@@ -79,18 +92,19 @@ def flow_tracks(
 ) -> PointTracks:
     """Follow points of the moving instances through a clip, forward and backward in time.
 
-    Points start on a grid (`grid` px of the working image) inside the instances, 2 px from their edges, at the first
-    frame and then every `restart_every` frames wherever no point is being followed. Frames wider than `max_width` are
-    tracked at that width; positions are returned in pixels of `rgb`. A point is visible where forward and backward
-    flow agree to 1 px + 1 %, its patch correlates with its anchor's by more than `min_ncc` and it lies on its
-    instance. Tracks seen in fewer than max(3, 2 %) of the frames are dropped. Confidence is exp(-fb²/2) * correlation.
+    Points start on a grid (`grid` px of the working image, finer on small instances) inside the instances, 2 px from
+    their edges, at the first frame and then every `restart_every` frames wherever no point is being followed. Frames
+    wider than `max_width` are tracked at that width; positions are returned in pixels of `rgb`. A point is visible
+    where forward and backward flow agree to 1 px + 1 %, its patch correlates with its anchor's by more than `min_ncc`
+    and it lies on its instance. Tracks seen in fewer than max(3, 2 %) of the frames are dropped. Confidence is
+    exp(-fb²/2) times the correlation.
     """
     frames, height, width = instances.shape
     size = (min(width, max_width), max(1, round(height * min(1.0, max_width / width))))
     labels = np.stack([cv2.resize(m, size, interpolation=cv2.INTER_NEAREST) for m in instances.cpu().numpy()])
-    xy, confidence = _follow(_open(rgb, size), labels, grid, restart_every, min_ncc)
+    xy, confidence = _follow(_open(rgb, labels), grid, restart_every, min_ncc)
     instance, on_instance = _vote(xy, confidence > 0, labels)
-    confidence = np.where(on_instance, confidence, 0)
+    confidence = np.where(on_instance, confidence, np.float32(0))
     kept = (instance > 0) & ((confidence > 0).sum(1) >= max(3, 0.02 * frames))
     factor = np.array([width / size[0], height / size[1]], np.float32)
     return PointTracks(
@@ -101,70 +115,76 @@ def flow_tracks(
     )
 
 
-def _open(rgb: UInt8[Tensor, "t h w 3"], size: tuple[int, int]) -> _Video:
-    """Grey frames of `size` (width, height) and everything that tracking needs of them."""
+def _open(rgb: UInt8[Tensor, "t H W 3"], labels: UInt8[ndarray, "t h w"]) -> _Video:
+    """Grey frames of the labels' size, and their flow."""
+    size = (labels.shape[2], labels.shape[1])
     frames = rgb.cpu().numpy()
     grey = [cv2.resize(cv2.cvtColor(f, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA) for f in frames]
-    dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    pairs = list(zip(grey[:-1], grey[1:], strict=True))
+    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    pairs = list(itertools.pairwise(grey))
     return _Video(
-        grey,
+        [image.astype(np.float32) for image in grey],
+        labels,
         [dis.calc(a, b, None).astype(np.float16) for a, b in pairs],
         [dis.calc(b, a, None).astype(np.float16) for a, b in pairs],
     )
 
 
 def _follow(
-    video: _Video, labels: UInt8[ndarray, "t h w"], grid: int, restart_every: int, min_ncc: float
+    video: _Video, grid: int, restart_every: int, min_ncc: float
 ) -> tuple[Float32[ndarray, "n t 2"], Float32[ndarray, "n t"]]:
-    """Positions and confidences of all tracks: one pass forward that also starts them, one backward."""
-    frames = len(labels)
-    points = _Points.start(_new_points(labels[0], np.zeros((0, 2), np.float32), grid), 0)
-    starts = [points.xy]  # of the tracks that begin at frame 0, restart_every, ...
-    passes = [[points]]
+    """Positions and confidences of all tracks: one pass forward, which also starts them, and one backward."""
+    frames = len(video.labels)
+    nothing = np.zeros((0, 2), np.float32)
+    points = _start(video, 0, _new_points(video.labels[0], nothing, grid))
+    starts, history = [points], [points]  # the tracks that begin at frames 0, restart_every, ...
     for target in range(1, frames):
         points = _advance(video, points, target - 1, target, min_ncc)
         if target % restart_every == 0:
-            starts.append(_new_points(labels[target], points.xy[points.confidence > 0], grid))
-            points = points.joined(_Points.start(starts[-1], target))
-        passes[0].append(points)
-    counts = np.cumsum([0] + [len(s) for s in starts])
-    xy = np.zeros((counts[-1], frames, 2), np.float32)
-    confidence = np.zeros((counts[-1], frames), np.float32)
-    for t, points in enumerate(passes[0]):
+            followed = points.xy[points.confidence > 0]
+            starts.append(_start(video, target, _new_points(video.labels[target], followed, grid)))
+            points = points.joined(starts[-1])
+        history.append(points)
+    count = len(points.xy)
+    xy, confidence = np.zeros((count, frames, 2), np.float32), np.zeros((count, frames), np.float32)
+    for t, points in enumerate(history):
         xy[: len(points.xy), t], confidence[: len(points.xy), t] = points.xy, points.confidence
-    points = _Points.start(np.zeros((0, 2), np.float32), 0)
+    points = _start(video, 0, nothing)
     for target in range(frames - 2, -1, -1):
         block, offset = divmod(target + 1, restart_every)
-        if offset == 0 and block < len(starts):
-            points = _Points.start(starts[block], target + 1).joined(points)
+        if offset == 0:
+            points = starts[block].joined(points)
         points = _advance(video, points, target + 1, target, min_ncc)
-        first = counts[-1] - len(points.xy)
+        first = count - len(points.xy)
         xy[first:, target], confidence[first:, target] = points.xy, points.confidence
     return xy, confidence
 
 
-def _new_points(
-    labels: UInt8[ndarray, "h w"], followed: Float32[ndarray, "n 2"], grid: int
-) -> Float32[ndarray, "m 2"]:
+def _start(video: _Video, frame: int, xy: Float32[ndarray, "n 2"]) -> _Points:
+    """Tracks that begin at a frame."""
+    n = len(xy)
+    return _Points(xy, np.ones(n, np.float32), np.zeros(n, int), np.full(n, frame), video.patches(frame, xy))
+
+
+def _new_points(labels: UInt8[ndarray, "h w"], followed: Float32[ndarray, "n 2"], grid: int) -> Float32[ndarray, "m 2"]:
     """Grid points well inside an instance that no followed point is near; on small instances the grid is finer."""
-    counts = np.zeros(labels.shape, np.uint8)
+    occupied = np.zeros(labels.shape, np.uint8)
     height, width = labels.shape
     column, row = followed.astype(int).T
-    counts[row.clip(0, height - 1), column.clip(0, width - 1)] = 1
-    points = []
+    occupied[row.clip(0, height - 1), column.clip(0, width - 1)] = 1
+    points: list[ndarray] = [np.zeros((0, 2), np.float32)]
     for instance in np.unique(labels[labels > 0]):
         mask = (labels == instance).astype(np.uint8)
         area = int(mask.sum())
         spacing = int(np.clip(math.sqrt(area / _POINTS_PER_INSTANCE), 2, grid))
         margin = _EDGE_MARGIN_PX if area > _SMALL_INSTANCE_PX else 1
         inside = cv2.erode(mask, _square(margin), borderType=cv2.BORDER_CONSTANT, borderValue=0)
-        covered = cv2.dilate(counts, _square(spacing - 1))
+        covered = cv2.dilate(occupied, _square(spacing - 1))
         lattice = np.zeros_like(mask)
         lattice[spacing // 2 :: spacing, spacing // 2 :: spacing] = 1
-        row, column = np.nonzero(inside & lattice & ~covered)
+        row, column = np.nonzero(inside & lattice & (1 - covered))
         points.append(np.stack((column, row), axis=1).astype(np.float32) + 0.5)
-    return np.concatenate(points) if points else np.zeros((0, 2), np.float32)
+    return np.concatenate(points)
 
 
 def _square(reach: int) -> UInt8[ndarray, "s s"]:
@@ -181,84 +201,53 @@ def _advance(video: _Video, points: _Points, source: int, target: int, min_ncc: 
         return after
     now = points.rows(live)
     followed = now.confidence > 0
-    forward, backward = video.flow(source, target)
-    step = np.where(followed[:, None], _sample(forward, now.xy), 0)
-    guess = now.xy + step
-    disagreement = np.where(followed, np.linalg.norm(step + _sample(backward, guess), axis=1), 0)
-    xy, ncc = _register(video, now, guess, target)
+    guess, disagreement = _guess(video, now, followed, source, target)
+    xy, ncc = register(now.anchor, video.grey[target], guess)
 
-    stale = followed & (ncc < _STALE_NCC) & (abs(now.anchor - target) >= _MIN_ANCHOR_AGE)
-    if stale.any():
-        renewed = _Points.start(now.xy[stale], source)
-        now.anchor[stale], now.anchor_xy[stale] = renewed.anchor, renewed.anchor_xy
-        xy[stale], ncc[stale] = _register(video, renewed, guess[stale], target)
+    stale = np.nonzero(followed & (ncc < _STALE_NCC) & (abs(now.anchored - target) >= _MIN_ANCHOR_AGE))[0]
+    if len(stale):
+        renewed = video.patches(source, now.xy[stale])
+        now.anchored[stale] = source
+        now.anchor.replace(stale, renewed)
+        xy[stale], ncc[stale] = register(renewed, video.grey[target], guess[stale])
 
-    agrees = disagreement < 1 + 0.01 * np.linalg.norm(step, axis=1)
+    step = np.linalg.norm(guess - now.xy, axis=1)
     height, width = video.grey[0].shape
     inside = (xy >= 0).all(1) & (xy[:, 0] < width) & (xy[:, 1] < height)
-    seen = inside & agrees & (ncc > np.where(followed, min_ncc, _FOUND_NCC))
+    seen = inside & (disagreement < 1 + 0.01 * step) & (ncc > np.where(followed, min_ncc, _FOUND_NCC))
     rows = live[seen]
-    after.xy[rows], after.lost_for[rows] = xy[seen], 0
-    after.anchor[rows], after.anchor_xy[rows] = now.anchor[seen], now.anchor_xy[seen]
+    after.xy[rows], after.lost_for[rows], after.anchored[rows] = xy[seen], 0, now.anchored[seen]
+    after.anchor.replace(rows, now.anchor.rows(seen))
     after.confidence[rows] = (np.exp(-(disagreement**2) / 2) * ncc)[seen]
     return after
 
 
-def _register(
-    video: _Video, points: _Points, guess: Float32[ndarray, "n 2"], target: int
+def _guess(
+    video: _Video, points: _Points, followed: Bool[ndarray, " n"], source: int, target: int
 ) -> tuple[Float32[ndarray, "n 2"], Float32[ndarray, " n"]]:
-    """Positions at frame `target` registered to the anchors, starting from `guess`, and their correlations."""
-    polished = guess.copy()
-    anchor_patches = np.empty((len(guess), _PATCH * _PATCH), np.float32)
-    for anchor in np.unique(points.anchor):
-        rows = points.anchor == anchor
-        anchor_patches[rows] = _patches(video.grey[anchor], points.anchor_xy[rows])
-        found, status, _ = cv2.calcOpticalFlowPyrLK(
-            video.grey[anchor],
-            video.grey[target],
-            (points.anchor_xy[rows] - 0.5).reshape(-1, 1, 2),
-            (guess[rows] - 0.5).reshape(-1, 1, 2),
-            winSize=_LK_WINDOW,
-            maxLevel=0,
-            criteria=_LK_STOP,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        )
-        polished[rows] = np.where(status > 0, found[:, 0] + 0.5, guess[rows])
-    near = np.linalg.norm(polished - guess, axis=1) < _MAX_POLISH_PX
-    polished = np.where(near[:, None], polished, guess)
-    ncc_guess = _correlation(anchor_patches, _patches(video.grey[target], guess))
-    ncc_polished = _correlation(anchor_patches, _patches(video.grey[target], polished))
-    better = ncc_polished >= ncc_guess
-    return np.where(better[:, None], polished, guess), np.where(better, ncc_polished, ncc_guess)
+    """Where flow takes the points, and by how much (px) forward and backward flow disagree; lost points stay.
+
+    Near edges the flow may be that of what lies behind: the mean flow of the instance thereabouts is tried as well.
+    """
+    forward, backward = video.flow(source, target)
+    best = (points.xy.copy(), np.zeros(len(points.xy), np.float32), np.full(len(points.xy), -np.inf, np.float32))
+    for mask in (None, video.labels[source] > 0):
+        there = sample(forward if mask is None else _masked_mean(forward, mask), points.xy)
+        guess = points.xy + there
+        back = sample(backward if mask is None else _masked_mean(backward, video.labels[target] > 0), guess)
+        disagreement = np.linalg.norm(there + back, axis=1)
+        ncc = points.anchor.correlation(video.grey[target], guess)
+        better = followed & (ncc > best[2])
+        for values, candidate in zip(best, (guess, disagreement, ncc), strict=True):
+            values[better] = candidate[better]
+    return best[:2]
 
 
-def _patches(grey: UInt8[ndarray, "h w"], xy: Float32[ndarray, "n 2"]) -> Float32[ndarray, "n p"]:
-    """Square patches about sub-pixel positions, one row each."""
-    offset = np.arange(_PATCH, dtype=np.float32) - _PATCH // 2
-    dy, dx = np.meshgrid(offset, offset, indexing="ij")
-    centre = xy - 0.5
-    return cv2.remap(
-        grey.astype(np.float32),
-        centre[:, :1] + dx.reshape(1, -1),
-        centre[:, 1:] + dy.reshape(1, -1),
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
-
-
-def _correlation(a: Float32[ndarray, "n p"], b: Float32[ndarray, "n p"]) -> Float32[ndarray, " n"]:
-    """Normalised cross-correlation of patches, row by row; two patches flatter than the noise count as alike."""
-    a, b = a - a.mean(1, keepdims=True), b - b.mean(1, keepdims=True)
-    energy = np.sqrt(((a * a).mean(1) + _NOISE_VARIANCE) * ((b * b).mean(1) + _NOISE_VARIANCE))
-    return ((a * b).mean(1) + _NOISE_VARIANCE) / energy
-
-
-def _sample(image: ndarray, xy: Float32[ndarray, "n 2"]) -> ndarray:
-    """Bilinear values of an image [h,w,c] at pixel positions."""
-    x, y = (xy - 0.5).T
-    return cv2.remap(
-        image, x[:, None].copy(), y[:, None].copy(), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    ).reshape(len(xy), -1)
+def _masked_mean(flow: Float32[ndarray, "h w 2"], mask: Bool[ndarray, "h w"]) -> Float32[ndarray, "h w 2"]:
+    """Mean flow of the masked pixels in a window about every pixel."""
+    window = (_SMOOTH_WINDOW, _SMOOTH_WINDOW)
+    weight = cv2.blur(mask.astype(np.float32), window)
+    return cv2.blur(flow * mask[..., None], window) / np.maximum(weight, 1e-6)[..., None]
 
 
 def _vote(

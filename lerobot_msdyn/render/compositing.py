@@ -226,11 +226,12 @@ def _blend_backward(buffer, cell, records, base, left, top, columns, rows, first
     xx, xy, yy, log2_opacity = _quadratic(records, base)
     planes = splat_planes(records, base + HEAD, layout)
     d_planes = zero_planes(layout)
-    sum_g, sum_x, sum_y = zeros(), zeros(), zeros()
-    sum_xx, sum_xy, sum_yy = zeros(), zeros(), zeros()
+    sum_g, sum_x, sum_v = zeros(), zeros(), zeros()
+    sum_xx, sum_xv, sum_vv = zeros(), zeros(), zeros()
     while row <= last_row:
         dy = lane_y() + splat(np.float32(row * BLOCK_HEIGHT) - center_y)
-        linear, half_slope, rest = xy * dy, yy * dy, fma(yy * dy, dy, log2_opacity)
+        linear, rest = xy * dy, fma(yy * dy, dy, log2_opacity)
+        row_g, row_x, row_xx = zeros(), zeros(), zeros()
         for column in range(at(first, row), at(last, row) + 1):
             dx = lane_x() + splat(np.float32(column * BLOCK_WIDTH) - center_x)
             partial = fma(xx, dx, linear)
@@ -245,12 +246,18 @@ def _blend_backward(buffer, cell, records, base, left, top, columns, rows, first
             store(buffer, place + LANES, remaining)
             g = alphas * (before * light - remaining / (splat(_ONE) - alphas))
             g = select(both(drawn, less(uncapped, splat(_MAX_ALPHA))), g, zeros())
-            slope_x, slope_y = fma(xx, dx, partial), fma(xy, dx, half_slope + half_slope)
-            gx, gy = g * slope_x, g * slope_y
-            sum_g, sum_x, sum_y = sum_g + g, sum_x + gx, sum_y + gy
-            sum_xx, sum_xy = fma(gx, slope_x, sum_xx), fma(gx, slope_y, sum_xy)
-            sum_yy = fma(gy, slope_y, sum_yy)
+            slope = fma(xx, dx, partial)
+            gx = g * slope
+            row_g, row_x, row_xx = row_g + g, row_x + gx, fma(gx, slope, row_xx)
+        row_v = row_g * dy
+        sum_g, sum_x, sum_xx = sum_g + row_g, sum_x + row_x, sum_xx + row_xx
+        sum_v, sum_xv, sum_vv = sum_v + row_v, fma(row_x, dy, sum_xv), fma(row_v, dy, sum_vv)
         row += 1
+    # slope in y = share (slope in x) + rest dy
+    share = splat(_HALF) * xy / xx
+    rest = yy + yy - share * xy
+    sum_y, sum_xy = fma(share, sum_x, rest * sum_v), fma(share, sum_xx, rest * sum_xv)
+    sum_yy = fma(share, sum_xy, rest * fma(share, sum_xv, rest * sum_vv))
     store_lane_sums(sums, slot, (sum_g, sum_x, sum_y, sum_xx, sum_xy, sum_yy), d_planes)
 
 

@@ -1,0 +1,59 @@
+"""What moves, from pictures alone."""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lerobot_msdyn.priors.masks import empty_scene, moving_instances, temporal_median
+
+
+def overlap(found: Tensor, truth: Tensor) -> float:
+    """Intersection over union."""
+    return float((found & truth).sum() / (found | truth).sum())
+
+
+def test_the_median_forgets_what_passes(sliding) -> None:
+    median, noise = temporal_median(sliding.rgb)
+    difference = np.abs(median.numpy().astype(float) - sliding.empty).mean(-1)
+    seldom_covered = sliding.mask.float().mean(0).numpy() < 0.3
+    assert np.quantile(difference[seldom_covered], 0.99) < 4
+    assert noise.min() >= 1
+    assert noise.shape == (72, 96)
+
+
+def test_a_block_is_found_also_while_it_rests(sliding) -> None:
+    """It rests for 8 frames at one place and for 10 at another, which both are partly in the median."""
+    median, noise = temporal_median(sliding.rgb)
+    instances = moving_instances(sliding.rgb, median, noise)
+    assert instances.max() == 1
+    for frame in (0, 4, 12, 18, 25, 29):
+        assert overlap(instances[frame] > 0, sliding.mask[frame]) > 0.75, frame
+
+
+def test_the_empty_scene_is_clean_of_what_rested_in_it(sliding) -> None:
+    median, _ = temporal_median(sliding.rgb)
+    clean = empty_scene(sliding.rgb, sliding.mask.to(torch.uint8), median)
+    seen = (~sliding.mask).sum(0).numpy() > 8
+    difference = np.abs(clean.numpy().astype(float) - sliding.empty).mean(-1)
+    assert np.quantile(difference[seen], 0.98) < 4
+    always = sliding.mask.to(torch.uint8).amin(0).bool()
+    assert (clean[always] == median[always]).all()
+
+
+def test_two_things_keep_their_numbers(sliding) -> None:
+    """A second, smaller block slides the other way below the first."""
+    rgb = sliding.rgb.clone()
+    for t in range(30):
+        x = 60 - t
+        rgb[t, 52:64, x : x + 12] = rgb[0, 28:40, 14:26].flip(-1)
+    median, noise = temporal_median(rgb)
+    instances = moving_instances(rgb, median, noise)
+    for t in (3, 14, 26):
+        assert instances[t, 34, int(sliding.corner[t, 0]) + 12] == 1
+        assert instances[t, 58, 66 - t] == 2
+
+
+def test_a_still_video_has_no_instances(sliding) -> None:
+    rgb = sliding.rgb[:1].expand(8, -1, -1, -1).contiguous()
+    median, noise = temporal_median(rgb)
+    assert not moving_instances(rgb, median, noise).any()
