@@ -1,7 +1,11 @@
 """New camera viewpoints for LeRobot datasets; the public names, each imported when it is first used."""
 
 import importlib
+import os
 from typing import Any
+
+# Idle OpenMP threads of torch would otherwise spin on the cores that the rasterizer needs. Read when torch is loaded.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 _HOMES = {
     "CameraTrack": "cameras",

@@ -8,7 +8,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from lerobot_msdyn.config import AugmentConfig
 from lerobot_msdyn.episode import depth_key_of
-from lerobot_msdyn.errors import ConfigError, EpisodeError
+from lerobot_msdyn.errors import ConfigError, EpisodeError, MsdynError
 from lerobot_msdyn.pipeline import augment_episode
 from lerobot_msdyn.write import NewEpisode, OutputDataset
 
@@ -42,6 +42,11 @@ def run_local(
             except EpisodeError as error:
                 logger.error("skipped: %s", error)
                 failures.append(error)
+            except MsdynError:
+                raise
+            except Exception as error:  # hours of other episodes' work must not be lost to a fault in one
+                logger.exception("skipped episode %d: a fault of lerobot_msdyn, please report it", index)
+                failures.append(EpisodeError(f"{source.repo_id} episode {index}: {type(error).__name__}: {error}"))
             bar.update(done - bar.n)
     return new, failures
 

@@ -36,8 +36,10 @@ def initialise(view: View, priors: Priors, scene: SceneConfig, motion: MotionCon
     background = static_depth(priors.depth, priors.instances)
     static = background_gaussians(priors.empty, background, view.camera, scene.static_gaussians)
     frames = len(view.rgb)
-    objects = object_motion(priors.tracks, priors.depth, view.camera, motion.max_parts)
-    if objects is None or scene.moving_gaussians == 0:
+    objects = None
+    if scene.moving_gaussians > 0:
+        objects = object_motion(priors.tracks, priors.depth, view.camera, motion.max_parts)
+    if objects is None:
         none = torch.zeros(0, dtype=torch.long)
         return _scene(static, static.select(none), none, identity_level(torch.zeros(1, 3), frames), frames)
     moving, part = gather_moving(view, priors, objects, scene)

@@ -57,14 +57,14 @@ def augment_episode(
     episode = read_episode(source, index, cameras, recipe.camera, recorded_depth=recipe.priors.depth != "plane")
     scenes = {}
     for key, view in episode.views.items():
-        progress(f"episode {index}: fitting {key}", 0)
+        progress(f"episode {index}: fitting {key}", 0.0)
         scenes[key] = reconstruct(view, recipe, lambda share: progress("", 0.5 * share / len(cameras)))
     priors = {key: scene.priors.provenance for key, scene in scenes.items()}
     new = []
     if recipe.include_source:
         new.append(NewEpisode(index, Provenance(source.repo_id, index, SOURCE_VARIANT, recipe.seed, {}, priors)))
     for variant in range(recipe.variants):
-        progress(f"episode {index}: rendering variant {variant}", 0)
+        progress(f"episode {index}: rendering variant {variant}", 0.0)
         rng = draw_rng(recipe.seed, index, variant)
         pictures, drawn = {}, {}
         for key, scene in scenes.items():

@@ -16,9 +16,11 @@ from lerobot.datasets.video_utils import decode_video_frames, get_video_duration
 from lerobot_msdyn.episode import TIMESTAMP_TOLERANCE_S, VIDEO_BACKEND
 from lerobot_msdyn.errors import EpisodeError, OutputError
 
-# FFmpeg and the AV1 encoder write to stderr past every logger: errors only.
-av.logging.set_libav_level(av.logging.ERROR)
-os.environ.setdefault("SVT_LOG", "1")
+
+def quiet_encoders() -> None:
+    """FFmpeg and the AV1 encoder write to stderr past every logger: let them write errors only."""
+    av.logging.set_libav_level(av.logging.ERROR)
+    os.environ.setdefault("SVT_LOG", "1")
 
 
 def encoder_of(feature: dict, key: str) -> RGBEncoderConfig | DepthEncoderConfig:
@@ -43,6 +45,7 @@ def encode_video(
 
 
 def _encode(frames: Iterable[av.VideoFrame], path: Path, fps: int, encoder: VideoEncoderConfig) -> int:
+    quiet_encoders()
     path.parent.mkdir(parents=True, exist_ok=True)
     count = 0
     with av.open(str(path), "w") as container:

@@ -3,7 +3,8 @@
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32
+from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.cameras import CameraTrack
@@ -28,7 +29,7 @@ def lift_tracks(
     n, frames = tracks.visible.shape
     if n == 0:
         return torch.zeros(0, frames, 3), torch.zeros(0, frames, dtype=torch.bool)
-    edges = torch.from_numpy(np.stack([_near_edge(d) for d in depth.cpu().numpy()]))
+    edges = torch.from_numpy(np.stack([near_depth_edge(d) for d in depth.cpu().numpy()]))
     column = tracks.xy[..., 0].long().clamp(0, depth.shape[2] - 1)
     row = tracks.xy[..., 1].long().clamp(0, depth.shape[1] - 1)
     time = torch.arange(frames).expand(n, -1)
@@ -50,14 +51,14 @@ def position_noise(xyz: Float[Tensor, "n t 3"], valid: Bool[Tensor, "n t"]) -> f
     return float(_NORMAL_MAD * second.abs().median() / 6**0.5)
 
 
-def _near_edge(depth: np.ndarray) -> np.ndarray:
-    """Pixels within two pixels of a depth edge; unknown depth is no edge."""
+def near_depth_edge(depth: Float32[ndarray, "h w"], margin_px: int = _EDGE_MARGIN_PX) -> Bool[ndarray, "h w"]:
+    """Pixels within `margin_px` (at least 1) of a depth edge; unknown depth is no edge."""
     known = depth > 0
     window = np.ones((3, 3), np.uint8)
     far = cv2.dilate(np.where(known, depth, 0).astype(np.float32), window)
     near = cv2.erode(np.where(known, depth, np.inf).astype(np.float32), window)
     edge = (far / (1 + _EDGE_JUMP) > near).astype(np.uint8)
-    side = 2 * _EDGE_MARGIN_PX - 1  # the window above reaches one pixel already
+    side = 2 * margin_px - 1  # the window above reaches one pixel already
     return cv2.dilate(edge, np.ones((side, side), np.uint8)) > 0
 
 

@@ -4,16 +4,9 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
-from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch import Tensor
 
-from lerobot_msdyn.geometry import (
-    axis_angle_to_matrix,
-    invert_se3,
-    se3,
-    transform_points,
-    weighted_procrustes,
-)
+from lerobot_msdyn.geometry import invert_se3, transform_points, weighted_procrustes
 
 MIN_EFFECTIVE = 5.0  # tracks that a frame needs for its motion to be accepted: (sum w)² / sum w²
 _IRLS_STEPS = 5
@@ -89,25 +82,6 @@ def residuals(xyz: Float[Tensor, "n t 3"], points: Float[Tensor, "h n 3"], fit: 
     """Distance (m) of every track from where each group's motion puts it."""
     moved = transform_points(fit.motions, points[:, None].expand(-1, fit.motions.shape[1], -1, -1))
     return (moved - xyz.transpose(0, 1)).norm(dim=-1).transpose(1, 2)
-
-
-def fill_gaps(
-    motions: Float[Tensor, "t 4 4"], accepted: Bool[Tensor, " t"], pivot: Float[Tensor, "3"]
-) -> Float[Tensor, "t 4 4"]:
-    """Motions also where none was accepted: slerp, and lerp of the pivot, inside; held beyond both ends."""
-    known = accepted.nonzero()[:, 0]
-    if len(known) == 0:
-        return torch.eye(4, dtype=motions.dtype).repeat(len(motions), 1, 1)
-    time = torch.arange(len(motions))
-    after = known[torch.searchsorted(known, time).clamp(max=len(known) - 1)]
-    before = known[(torch.searchsorted(known, time, right=True) - 1).clamp(min=0)]
-    fraction = ((time - before) / (after - before).clamp(min=1)).clamp(0, 1).to(motions.dtype)[:, None]
-    start, end = motions[before], motions[after]
-    turn = rotation_matrix_to_axis_angle((start[:, :3, :3].transpose(1, 2) @ end[:, :3, :3]).contiguous())
-    rotation = start[:, :3, :3] @ axis_angle_to_matrix(fraction * turn)
-    centre = pivot.expand(len(time), 1, 3)
-    moved = torch.lerp(transform_points(start, centre)[:, 0], transform_points(end, centre)[:, 0], fraction)
-    return se3(rotation, moved - rotation @ pivot)
 
 
 def _sweep(xyz: Float[Tensor, "n t 3"], weights: Float[Tensor, "h n t"], min_effective: float) -> RigidFit:

@@ -171,6 +171,8 @@ def _times_alike(
 
 
 def _patches(image: Float32[ndarray, "h w"], xy: Float32[ndarray, "n 2"]) -> Float32[ndarray, "n p"]:
+    if len(xy) == 0:
+        return np.zeros((0, _HOME_PATCH**2), np.float32)
     offset = np.arange(_HOME_PATCH, dtype=np.float32) - _HOME_PATCH // 2
     dy, dx = np.meshgrid(offset, offset, indexing="ij")
     x, y = (xy.astype(np.float32) - 0.5).T

@@ -80,8 +80,12 @@ def record(
         OutputError: `root` exists.
     """
     # importing LeRobot's datasets takes seconds, and a scene alone needs none of it
+    from lerobot.configs import DepthEncoderConfig
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+    from lerobot_msdyn.video import quiet_encoders
+
+    quiet_encoders()
     if root.exists():
         raise OutputError(f"{root} exists already; remove it or choose another folder for the synthetic dataset")
     dataset = LeRobotDataset.create(
@@ -93,6 +97,7 @@ def record(
         use_videos=any(feature["dtype"] == "video" for feature in features.values()),
         video_backend="pyav",
         rgb_encoder=rgb_encoder,
+        depth_encoder=DepthEncoderConfig(extra_options={"x265-params": "lossless=1:log-level=error"}),
     )
     for scene, views in episodes:
         for t in range(len(scene)):

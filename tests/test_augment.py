@@ -1,0 +1,171 @@
+"""The command line, end to end: what a user types, what comes out, and what is refused."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+from lerobot.datasets import LeRobotDataset
+
+from lerobot_msdyn import augment
+from lerobot_msdyn.cli import run_command
+
+FRONT, SIDE = "observation.images.front", "observation.images.side"
+FAST = ("--fit.steps", "8", "--scene.moving_gaussians", "500", "--scene.moving_frames", "4", "--fit.max_width", "48")
+
+
+def run(*arguments: str) -> int:
+    """The exit code of the command."""
+    with pytest.raises(SystemExit) as caught:
+        run_command(augment.run, [*arguments])
+    assert isinstance(caught.value.code, int)
+    return caught.value.code
+
+
+@pytest.fixture(scope="module")
+def augmented(desk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Episodes 0 and 2, front camera, two variants each."""
+    out = tmp_path_factory.mktemp("augmented") / "new"
+    arguments = ["--repo", "local/desk", "--root", str(desk), "--new_root", str(out), "--episodes", "[2,0]"]
+    assert run(*arguments, "--cameras", "[front]", "--variants", "2", *FAST) == 0
+    return out
+
+
+def test_output_is_the_source_seen_from_elsewhere(desk: Path, augmented: Path) -> None:
+    source = LeRobotDataset("local/desk", root=desk, video_backend="pyav")
+    output = LeRobotDataset("local/desk_msdyn", root=augmented, video_backend="pyav")
+    origin = [0, 0, 0, 2, 2, 2]
+    assert output.num_episodes == 6
+    position = 0
+    for number, old in enumerate(origin):
+        row = source.meta.episodes[old]
+        changed = []
+        for i in range(row["length"]):
+            a, b = source[row["dataset_from_index"] + i], output[position]
+            assert a.keys() == b.keys()
+            for key in ("action", "observation.state", "timestamp", "frame_index", "task_index", SIDE, f"{SIDE}_depth"):
+                assert torch.equal(a[key], b[key]), (number, i, key)
+            assert a["task"] == b["task"]
+            changed.append(float((a[FRONT] - b[FRONT]).abs().mean()))
+            position += 1
+        if number % 3 == 0:
+            assert max(changed) == 0
+        else:
+            assert min(changed) > 0.01, "the view did not change"
+            assert max(changed) < 0.3, "the view has nothing to do with the recorded one"
+
+
+def test_variants_differ_and_episodes_say_where_they_come_from(augmented: Path) -> None:
+    output = LeRobotDataset("local/desk_msdyn", root=augmented, video_backend="pyav")
+    starts = output.meta.episodes["dataset_from_index"]
+    assert not torch.equal(output[starts[1]][FRONT], output[starts[2]][FRONT])
+    rows = pq.read_table(augmented / "meta" / "msdyn" / "episodes.parquet").to_pylist()
+    assert [(row["source_episode"], row["variant"]) for row in rows] == [(e, v) for e in (0, 2) for v in (-1, 0, 1)]
+    drawn = json.loads(rows[1]["perturbation"])[FRONT]
+    assert abs(drawn["azimuth_deg"]) <= 10
+
+
+def test_the_same_command_gives_the_same_pictures(desk: Path, augmented: Path, tmp_path: Path) -> None:
+    arguments = ["--repo", "local/desk", "--root", str(desk), "--new_root", str(tmp_path / "new"), "--episodes", "[2]"]
+    options = ["--cameras", "[front]", "--variants", "1", "--include_source", "false"]
+    assert run(*arguments, *options, *FAST) == 0
+    first = LeRobotDataset("local/desk_msdyn", root=augmented, video_backend="pyav")
+    second = LeRobotDataset("local/desk_msdyn", root=tmp_path / "new", video_backend="pyav")
+    assert second.num_episodes == 1
+    start = first.meta.episodes[4]["dataset_from_index"]
+    for i in range(len(second)):
+        assert torch.equal(first[start + i][FRONT], second[i][FRONT])
+
+
+def test_dry_run_writes_nothing(desk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("--repo", "local/desk", "--root", str(desk), "--new_root", str(tmp_path / "new"), "--dry_run") == 0
+    said = capsys.readouterr().out
+    assert "3 episodes, 36 frames" in said
+    assert "2 new per episode: 9 episodes, 108 frames, 144 new pictures" in said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_output_stands_beside_the_source_by_default(desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("--repo", "local/desk", "--root", str(desk), "--dry_run") == 0
+    assert f"would be written to {desk.parent / 'desk_msdyn'}" in capsys.readouterr().out
+
+
+def test_bad_input_is_one_line_and_exit_code_2(
+    desk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "there").mkdir()
+    old = tmp_path / "old"
+    shutil.copytree(desk, old)
+    info = old / "meta" / "info.json"
+    info.write_text(json.dumps(json.loads(info.read_text()) | {"codebase_version": "v2.1"}))
+    recipe = tmp_path / "mine.yaml"
+    recipe.write_text("variantz: 3\n")
+    wrong = tmp_path / "wrong.yaml"
+    wrong.write_text("variants: many\n")
+    source = ["--repo", "local/desk", "--root", str(desk), "--new_root", str(tmp_path / "new")]
+    cases = [
+        ([], "which dataset?"),
+        (["--repo", "local/absent", "--root", str(tmp_path / "absent")], "no dataset in"),
+        (["--repo", "local/absent"], "no dataset 'local/absent'"),
+        (["--repo", "local/desk", "--root", str(old)], "convert_dataset_v21_to_v30"),
+        ([*source, "--cameras", "[top]"], "no colour camera 'top'; it has"),
+        ([*source, "--episodes", "[7]"], "no episode 7; it has 3 (0 to 2)"),
+        ([*source, "--new_root", str(tmp_path / "there")], "exists already"),
+        ([*source, "--recipe", str(recipe)], "unknown field 'variantz', did you mean 'variants'?"),
+        ([*source, "--recipe", str(wrong)], "Couldn't parse 'many' into an int"),
+        ([*source, "--priors.depth", str(tmp_path / "no.npz")], "no readable `depth`"),
+        ([*source, "--device", "cuda"], "--device cpu"),
+    ]
+    for arguments, message in cases:
+        assert run(*arguments) == 2, arguments
+        said = capsys.readouterr().err
+        errors = [line for line in said.splitlines() if line.startswith("error: ")]
+        assert len(errors) == 1, said
+        assert message in errors[0]
+        assert "Traceback" not in said
+        assert not (tmp_path / "new").exists()
+    assert not any(path.name.endswith(".partial") for path in tmp_path.iterdir())
+
+
+def test_a_truncated_video_costs_its_episode_only(
+    half_broken_desk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--repo", "local/desk", "--root", str(half_broken_desk), "--new_root", str(tmp_path / "new")]
+    assert run(*arguments, "--variants", "1", *FAST) == 1
+    said = capsys.readouterr().out
+    assert "1 of 2 episodes, 1 new ones" in said
+    assert "skipped: local/desk episode 1, observation.images.front" in said
+    output = LeRobotDataset("local/desk_msdyn", root=tmp_path / "new", video_backend="pyav")
+    assert output.num_episodes == 2
+    assert np.isfinite([float(output[i][FRONT].mean()) for i in range(len(output))]).all()
+
+
+@pytest.fixture
+def half_broken_desk(desk: Path, tmp_path: Path) -> Path:
+    """Two episodes in two mp4 files, the second of which ends in the middle."""
+    from lerobot_msdyn.episode import open_source
+    from lerobot_msdyn.provenance import Provenance
+    from lerobot_msdyn.write import NewEpisode, OutputDataset
+
+    root = tmp_path / "broken"
+    source = open_source("local/desk", desk)
+    source.info.video_files_size_in_mb = 1e-6  # one episode per file
+    with OutputDataset(source, "local/desk", root) as output:
+        output.finish([NewEpisode(i, Provenance("local/desk", i, -1, 0)) for i in range(2)], "")
+    files = sorted((root / "videos" / FRONT).rglob("*.mp4"))
+    assert len(files) == 2
+    files[1].write_bytes(files[1].read_bytes()[: files[1].stat().st_size * 2 // 3])
+    return root
+
+
+def test_as_a_module() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "lerobot_msdyn.augment", "--variantz", "3"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert done.stderr == "error: command line: unknown field 'variantz', did you mean 'variants'?\n"
