@@ -12,7 +12,14 @@ from torch import Tensor
 from lerobot_msdyn.background import background_gaussians, fill_depth, pixel_gaussians
 from lerobot_msdyn.config import MotionConfig, SceneConfig
 from lerobot_msdyn.episode import View
-from lerobot_msdyn.geometry import invert_se3, matrix_to_quaternion, quaternion_multiply, se3
+from lerobot_msdyn.geometry import (
+    invert_se3,
+    matrix_to_quaternion,
+    project,
+    quaternion_multiply,
+    se3,
+    transform_points,
+)
 from lerobot_msdyn.motion.bases import MotionLevel, identity_level, level_affines
 from lerobot_msdyn.motion.initialise import ObjectMotion, object_motion
 from lerobot_msdyn.priors import Priors
@@ -20,6 +27,8 @@ from lerobot_msdyn.priors.depth import static_depth
 from lerobot_msdyn.scene import DynamicScene, Gaussians, concatenate
 
 MASK_BORDER_PX = 1  # pixels along the border of a mask mix two surfaces
+FRONT_MARGIN = 0.01  # a point nearer than this share of the recorded depth is in front of it
+MAX_CONTRADICTIONS = 0.3  # share of frames in which a point may be missing where it should have been seen
 VOXEL_GROWTH = 1.15  # of the voxels' side, until there are few enough
 EDGE_JUMP = 0.03  # relative difference of neighbouring depths beyond which a pixel may lie between two surfaces
 
@@ -55,8 +64,9 @@ def gather_moving(
     pixel's size, so that what one frame hides is taken from another. Larger voxels are used where these are too many.
     """
     count = min(config.moving_frames, len(view.rgb))
+    frames = torch.linspace(0, len(view.rgb) - 1, count).round().long().unique().tolist()
     gathered, parts = [], []
-    for frame in torch.linspace(0, len(view.rgb) - 1, count).round().long().unique().tolist():
+    for frame in frames:
         inside = _certain(priors.instances[frame] > 0, priors.depth[frame]).reshape(-1)
         if not bool(inside.any()):
             continue
@@ -77,7 +87,39 @@ def gather_moving(
         growth *= VOXEL_GROWTH
         merged = merge_voxels(points, part, growth * voxel)
     moving, part = merged
+    kept = ~contradicted(moving.means, part, objects.level, view, priors, frames)
+    moving, part = moving.select(kept), part[kept]
     return replace(moving, log_scales=moving.log_scales + math.log(growth)), part
+
+
+def contradicted(
+    points: Float[Tensor, "n 3"],
+    part: Int[Tensor, " n"],
+    level: MotionLevel,
+    view: View,
+    priors: Priors,
+    frames: list[int],
+) -> Bool[Tensor, " n"]:
+    """Canonical points (m) that should have been seen, but were not.
+
+    A point that its part's motion puts in front of the recorded surface, where nothing moves, cannot be there; too
+    many such frames among those in which it is inside the image are held against it.
+    """
+    wrong, inside = torch.zeros(len(points)), torch.zeros(len(points))
+    height, width = priors.depth.shape[1:]
+    for frame in frames:
+        affine = level_affines(level, torch.tensor([frame]))[part, 0]
+        world = (affine[:, :, :3] @ points[:, :, None])[..., 0] + affine[:, :, 3]
+        camera = view.camera.select([frame])
+        xy, z = project(transform_points(camera.camera_from_world, world[None])[0], camera.intrinsics[0])
+        column, row = xy.floor().long().unbind(-1)
+        shown = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (z > 0)
+        column, row = column.clamp(0, width - 1), row.clamp(0, height - 1)
+        surface = priors.depth[frame, row, column]
+        still = _grown(priors.instances[frame] > 0)[row, column].logical_not()
+        wrong += shown & still & (surface > 0) & (z < (1 - FRONT_MARGIN) * surface)
+        inside += shown
+    return wrong > MAX_CONTRADICTIONS * inside
 
 
 def to_canonical(gaussians: Gaussians, part: Int[Tensor, " n"], level: MotionLevel, frame: int) -> Gaussians:
@@ -115,6 +157,12 @@ def _certain(mask: Bool[Tensor, "h w"], depth: Float[Tensor, "h w"]) -> Bool[Ten
     z = depth.numpy()
     edge = cv2.dilate(z, window) > (1 + EDGE_JUMP) * cv2.erode(z, window)
     return torch.from_numpy(inside & (z > 0) & ~edge)
+
+
+def _grown(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+    """A mask with its border, where it cannot be trusted."""
+    window = np.ones((2 * MASK_BORDER_PX + 3,) * 2, np.uint8)
+    return torch.from_numpy(cv2.dilate(mask.numpy().astype(np.uint8), window) > 0)
 
 
 def _scene(

@@ -95,9 +95,7 @@ def test_output_stands_beside_the_source_by_default(desk: Path, capsys: pytest.C
     assert f"would be written to {desk.parent / 'desk_msdyn'}" in capsys.readouterr().out
 
 
-def test_bad_input_is_one_line_and_exit_code_2(
-    desk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_input_is_one_line_and_exit_code_2(desk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "there").mkdir()
     old = tmp_path / "old"
     shutil.copytree(desk, old)
@@ -161,6 +159,25 @@ def half_broken_desk(desk: Path, tmp_path: Path) -> Path:
     assert len(files) == 2
     files[1].write_bytes(files[1].read_bytes()[: files[1].stat().st_size * 2 // 3])
     return root
+
+
+def test_a_fault_in_one_episode_does_not_cost_the_others(
+    desk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from lerobot_msdyn import engines
+
+    whole = engines.augment_episode
+
+    def faulty(source: object, index: int, *rest: object) -> object:
+        if index == 0:
+            raise RuntimeError("a fault")
+        return whole(source, index, *rest)
+
+    monkeypatch.setattr(engines, "augment_episode", faulty)
+    arguments = ["--repo", "local/desk", "--root", str(desk), "--new_root", str(tmp_path / "new")]
+    assert run(*arguments, "--episodes", "[0,1]", "--cameras", "[front]", "--variants", "1", *FAST) == 1
+    assert "skipped: local/desk episode 0: RuntimeError: a fault" in capsys.readouterr().out
+    assert LeRobotDataset("local/desk_msdyn", root=tmp_path / "new", video_backend="pyav").num_episodes == 2
 
 
 def test_as_a_module() -> None:

@@ -8,9 +8,9 @@ import torch
 from lerobot_msdyn.background import background_gaussians, fill_depth, pixel_gaussians, surface_frames
 from lerobot_msdyn.cameras import CameraTrack, intrinsics_from_fov, static_camera
 from lerobot_msdyn.geometry import project, quaternion_to_matrix, transform_points, unproject_image
+from lerobot_msdyn.motion.bases import identity_level
 from lerobot_msdyn.perturbation import orbit_offset
 from lerobot_msdyn.rendering import draw
-from lerobot_msdyn.motion.bases import identity_level
 from lerobot_msdyn.scene import DynamicScene
 
 WIDTH, HEIGHT = 32, 24

@@ -145,3 +145,7 @@ def test_help_answers_without_importing_torch() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "--fit.steps" in done.stdout
+
+
+def test_the_default_recipe_holds_the_defaults() -> None:
+    assert parse("--recipe", "default") == AugmentConfig()

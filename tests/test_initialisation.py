@@ -6,12 +6,13 @@ import pytest
 import torch
 
 from lerobot_msdyn.background import pixel_gaussians
+from lerobot_msdyn.cameras import intrinsics_from_fov, static_camera
 from lerobot_msdyn.config import MotionConfig, SceneConfig
 from lerobot_msdyn.episode import View
 from lerobot_msdyn.fitting import train_psnr
-from lerobot_msdyn.geometry import axis_angle_to_matrix, quaternion_to_matrix, se3
-from lerobot_msdyn.initialisation import initialise, merge_voxels, to_canonical
-from lerobot_msdyn.motion.bases import level_from_motions
+from lerobot_msdyn.geometry import axis_angle_to_matrix, quaternion_to_matrix, se3, unproject
+from lerobot_msdyn.initialisation import contradicted, initialise, merge_voxels, to_canonical
+from lerobot_msdyn.motion.bases import identity_level, level_from_motions
 from lerobot_msdyn.priors import PointTracks, Priors
 from lerobot_msdyn.scene import DynamicScene, gaussians_from_points
 from lerobot_msdyn.synthetic import make_scene
@@ -102,3 +103,22 @@ def test_moving_gaussians_lie_on_the_recorded_surface(pushed: tuple[View, Priors
     distance = torch.cdist(surface.means[inside], moving).min(dim=1).values
     pixel = priors.depth[frame].reshape(-1)[inside].median() / view.camera.intrinsics[0, 0, 0]
     assert float(distance.median()) < float(pixel)
+
+
+def test_points_in_front_of_what_stands_still_are_contradicted() -> None:
+    camera = static_camera(intrinsics_from_fov(40, 30, 60.0), 4, 40, 30)
+    depth = torch.ones(4, 30, 40)
+    instances = torch.zeros(4, 30, 40, dtype=torch.uint8)
+    instances[:, 10:20, 10:20] = 1
+    view = View(torch.zeros(4, 30, 40, 3, dtype=torch.uint8), camera)
+    nothing = PointTracks(
+        torch.zeros(0, 4, 2), torch.zeros(0, 4, dtype=torch.bool), torch.zeros(0, 4), torch.zeros(0, dtype=torch.long)
+    )
+    priors = Priors(depth, instances, view.rgb[0], nothing, metric=True)
+    xy = torch.tensor([[15.0, 15.0], [30.0, 15.0], [30.0, 15.0], [-9.0, 15.0]])
+    z = torch.tensor([0.9, 0.9, 1.1, 0.9])  # on the mask; in front of the wall; behind it; outside the image
+    points = unproject(xy, z, camera.intrinsics[0])
+    found = contradicted(
+        points, torch.zeros(4, dtype=torch.long), identity_level(torch.zeros(1, 3), 4), view, priors, [0, 1, 2, 3]
+    )
+    assert found.tolist() == [False, True, False, False]

@@ -37,7 +37,11 @@ def scene_with_two_parts() -> DynamicScene:
 
 def test_points_become_gaussians() -> None:
     gaussians = gaussians_from_points(
-        torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.02), torch.tensor([[0.1, 0.5, 0.9]]), 0.7
+        torch.zeros(1, 3),
+        torch.tensor([[1.0, 0, 0, 0]]),
+        torch.full((1, 3), 0.02),
+        torch.tensor([[0.1, 0.5, 0.9]]),
+        0.7,
     )
     torch.testing.assert_close(gaussians.log_scales.exp(), torch.full((1, 3), 0.02))
     torch.testing.assert_close(gaussians.opacity_logits.sigmoid(), torch.tensor([0.7]))

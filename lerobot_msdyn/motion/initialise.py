@@ -8,10 +8,11 @@ from torch import Tensor
 
 from lerobot_msdyn.cameras import CameraTrack
 from lerobot_msdyn.geometry import invert_se3, transform_points
-from lerobot_msdyn.motion.bases import MotionLevel, level_affines, level_from_motions
+from lerobot_msdyn.motion.bases import MotionLevel, identity_level, level_affines, level_from_motions
+from lerobot_msdyn.motion.gaps import STILL, fill_gaps, find_carriers
 from lerobot_msdyn.motion.lift import lift_tracks
 from lerobot_msdyn.motion.parts import split_rigid_parts
-from lerobot_msdyn.motion.rigid import fill_gaps, fit_rigid, model_points
+from lerobot_msdyn.motion.rigid import fit_rigid, model_points
 from lerobot_msdyn.priors.types import PointTracks
 
 _MIN_SEEN = 3  # frames, and 5 % of the clip, in which a track must be seen
@@ -104,43 +105,53 @@ def initialise_objects(
 ) -> tuple[MotionLevel, Float[Tensor, "n 3"]]:
     """One basis per part, the identity at the canonical frame, and every track's point (m) at that frame.
 
-    Frames in which too few tracks support a part are bridged by interpolation, and held beyond its first and last
-    sight. A part that is never supported stands still.
+    Where too few tracks support a part, it goes with the part that it moved with before (a held block with the
+    gripper), or stands still. A part that is never supported stands still altogether.
     """
-    count = int(part.max()) + 1 if len(part) else 0
-    frames = xyz.shape[1]
-    motions = torch.eye(4).repeat(count, frames, 1, 1)
-    pivots, points = torch.zeros(count, 3), torch.zeros(len(xyz), 3)
-    for k in range(count):
-        rows = part == k
-        weights = torch.where(valid, confidence.square(), 0.0)[rows]
-        motion, canonical_points = _part_motion(xyz[rows], weights, canonical)
-        motions[k] = motion.float()
-        points[rows] = canonical_points.float()
-        pivots[k] = points[rows].mean(0)
-    return level_from_motions(motions, pivots), points
+    weights = torch.where(valid, confidence.square(), 0.0)
+    rows = [(part == k).nonzero()[:, 0] for k in range(int(part.max()) + 1)] if len(part) else []
+    fitted = [_fit_part(xyz[r], weights[r], None) for r in rows]
+    if not fitted:
+        return identity_level(torch.zeros(0, 3), xyz.shape[1]), torch.zeros(0, 3)
+    motions, accepted = (torch.stack([getattr(f, name) for f in fitted]) for name in ("motions", "accepted"))
+    carriers = find_carriers(motions, accepted, torch.stack([f.pivot for f in fitted]))
+    points = torch.zeros(len(xyz), 3)
+    # carriers are followed farther than what they carry, so they are completed first
+    for k in sorted(range(len(rows)), key=lambda k: -int(accepted[k].sum())):
+        carrier = int(carriers[k])
+        carry = None if carrier == STILL else motions[carrier]
+        fit = fitted[k] if carry is None else _fit_part(xyz[rows[k]], weights[rows[k]], carry)
+        filled = fill_gaps(fit.motions, fit.accepted, fit.pivot, carry)
+        motions[k] = filled @ invert_se3(filled[canonical])
+        points[rows[k]] = _canonical_points(xyz[rows[k]], weights[rows[k]], motions[k], fit.accepted).float()
+    pivots = torch.stack([points[r].mean(0) for r in rows])
+    return level_from_motions(motions.float(), pivots), points
 
 
-def _part_motion(
-    xyz: Float[Tensor, "n t 3"], weights: Float[Tensor, "n t"], canonical: int
-) -> tuple[Float[Tensor, "t 4 4"], Float[Tensor, "n 3"]]:
-    fit = fit_rigid(xyz, weights[None])
+@dataclass(frozen=True)
+class _PartFit:
+    motions: Float[Tensor, "t 4 4"]  # from the part's own reference frame
+    accepted: Bool[Tensor, " t"]
+    pivot: Float[Tensor, "3"]  # m, at that frame
+
+
+def _fit_part(
+    xyz: Float[Tensor, "n t 3"], weights: Float[Tensor, "n t"], carry: Float[Tensor, "t 4 4"] | None
+) -> _PartFit:
+    fit = fit_rigid(xyz, weights[None], carry=None if carry is None else carry[None])
     points, known = model_points(xyz, weights, fit)
-    accepted = fit.support[0] > 0
-    if not (accepted.any() and known.any()):
-        mean = (weights[..., None] * xyz).sum(1) / weights.sum(1, keepdim=True).clamp(min=1e-12)
-        return torch.eye(4).repeat(xyz.shape[1], 1, 1), mean
-    pivot = points[0, known[0]].mean(0)
-    motions = fill_gaps(fit.motions[0], accepted, pivot)
-    # tracks that the part never met while it was supported are put where they were seen, carried back
-    last_resort = _carried_back(xyz.double(), weights.double(), motions)
-    placed = torch.where(known[0][:, None], points[0], last_resort)
-    at_canonical = motions[canonical]
-    return motions @ invert_se3(at_canonical), transform_points(at_canonical, placed)
+    seen = known[0] if known.any() else torch.ones_like(known[0])
+    return _PartFit(fit.motions[0], fit.support[0] > 0, points[0, seen].mean(0))
 
 
-def _carried_back(
-    xyz: Float[Tensor, "n t 3"], weights: Float[Tensor, "n t"], motions: Float[Tensor, "t 4 4"]
+def _canonical_points(
+    xyz: Float[Tensor, "n t 3"],
+    weights: Float[Tensor, "n t"],
+    motions: Float[Tensor, "t 4 4"],
+    accepted: Bool[Tensor, " t"],
 ) -> Float[Tensor, "n 3"]:
-    back = transform_points(invert_se3(motions), xyz.transpose(0, 1))
-    return torch.einsum("nt,tnc->nc", weights, back) / weights.sum(1, keepdim=True).clamp(min=1e-12)
+    """Tracks carried back, over the frames in which their part was followed; over all of them if that leaves none."""
+    back = transform_points(invert_se3(motions), xyz.transpose(0, 1).double())
+    followed = weights.double() * accepted
+    used = torch.where(followed.sum(1, keepdim=True) > 0, followed, weights.double())
+    return torch.einsum("nt,tnc->nc", used, back) / used.sum(1, keepdim=True).clamp(min=1e-12)

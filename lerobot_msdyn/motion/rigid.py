@@ -28,14 +28,18 @@ def fit_rigid(
     weights: Float[Tensor, "h n t"],
     refinements: int = 8,
     min_effective: float = MIN_EFFECTIVE,
+    carry: Float[Tensor, "h t 4 4"] | None = None,
 ) -> RigidFit:
     """Rigid motion of each of h groups; `weights` (0 = not a member, or not seen) say which tracks it may use.
 
     From the frame with most tracks outward, each frame is registered to a model of all tracks met so far, so that
     tracks need not share a frame (docs/method.md, level 1). Then model and motions are refined in turn (generalised
     Procrustes analysis with missing data). All fits are robust (iterated Geman-McClure weights).
+
+    `carry` is the motion of whatever carries a group while the group itself cannot be followed: with it, tracks that
+    turn up after a gap join the model where the carrier has taken it.
     """
-    fit = _sweep(xyz.double(), weights.double(), min_effective)
+    fit = _sweep(xyz.double(), weights.double(), min_effective, carry)
     for _ in range(refinements):
         fit = refine(xyz, weights, fit, min_effective)
     return fit
@@ -84,7 +88,12 @@ def residuals(xyz: Float[Tensor, "n t 3"], points: Float[Tensor, "h n 3"], fit: 
     return (moved - xyz.transpose(0, 1)).norm(dim=-1).transpose(1, 2)
 
 
-def _sweep(xyz: Float[Tensor, "n t 3"], weights: Float[Tensor, "h n t"], min_effective: float) -> RigidFit:
+def _sweep(
+    xyz: Float[Tensor, "n t 3"],
+    weights: Float[Tensor, "h n t"],
+    min_effective: float,
+    carry: Float[Tensor, "h t 4 4"] | None,
+) -> RigidFit:
     """First motions: outward from each group's fullest frame, every frame against the model so far."""
     groups, _, frames = weights.shape
     every, floor = torch.arange(groups), _floor(xyz, weights)
@@ -106,16 +115,32 @@ def _sweep(xyz: Float[Tensor, "n t 3"], weights: Float[Tensor, "h n t"], min_eff
             target = xyz[:, at].transpose(0, 1)
             seen = weights[rows, :, at]
             usable = seen * (count[rows] > 0)
+            if carry is not None:
+                last[rows] = carry[rows, at] @ invert_se3(carry[rows, at - direction]) @ last[rows]
             motion, effective = _register(model[rows], target, usable, floor[rows], last[rows])
             accepted = effective >= min_effective
+            if carry is not None:
+                accepted, motion = _or_carried(accepted, motion, last[rows], seen, min_effective)
             last[rows] = torch.where(accepted[:, None, None], motion, last[rows])
             motions[rows, at] = last[rows]
-            support[rows, at] = torch.where(accepted, effective, 0.0)
+            support[rows, at] = torch.where(accepted, effective.clamp(min=1e-6), 0.0)
             new = (seen > 0) & accepted[:, None]
             share = (new / (count[rows] + 1))[..., None]
             model[rows] += share * (transform_points(invert_se3(last[rows]), target) - model[rows])
             count[rows] = (count[rows] + new).clamp(max=_MODEL_MEMORY)
     return RigidFit(motions, support)
+
+
+def _or_carried(
+    accepted: Bool[Tensor, " h"],
+    motion: Float[Tensor, "h 4 4"],
+    carried: Float[Tensor, "h 4 4"],
+    seen: Float[Tensor, "h n"],
+    min_effective: float,
+) -> tuple[Bool[Tensor, " h"], Float[Tensor, "h 4 4"]]:
+    """Where the model is not seen but enough other tracks are, take the carrier's word."""
+    restart = ~accepted & (_effective(seen) >= min_effective)
+    return accepted | restart, torch.where(restart[:, None, None], carried, motion)
 
 
 def _register(

@@ -23,6 +23,7 @@ from lerobot_msdyn.priors.types import PointTracks
 _POINTS_PER_INSTANCE = 400  # at a time; instances too small for that get a finer grid, down to 2 px
 _EDGE_MARGIN_PX = 2  # of the first points of a track from the edge of their instance ...
 _SMALL_INSTANCE_PX = 1000  # ... and half of that in instances smaller than this
+_BACKGROUND_GREY = 128
 _SMOOTH_WINDOW = 9  # px, over which an instance's flow is averaged for the second guess
 _STALE_NCC = 0.8  # below this the anchor no longer looks like the point: take a newer one ...
 _MIN_ANCHOR_AGE = 4  # ... unless it is younger than this, in frames
@@ -120,14 +121,23 @@ def _open(rgb: UInt8[Tensor, "t H W 3"], labels: UInt8[ndarray, "t h w"]) -> _Vi
     size = (labels.shape[2], labels.shape[1])
     frames = rgb.cpu().numpy()
     grey = [cv2.resize(cv2.cvtColor(f, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA) for f in frames]
+    alone = [_without_background(image, mask) for image, mask in zip(grey, labels > 0, strict=True)]
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    pairs = list(itertools.pairwise(grey))
+    pairs = list(itertools.pairwise(alone))
     return _Video(
         [image.astype(np.float32) for image in grey],
         labels,
         [dis.calc(a, b, None).astype(np.float16) for a, b in pairs],
         [dis.calc(b, a, None).astype(np.float16) for a, b in pairs],
     )
+
+
+def _without_background(grey: UInt8[ndarray, "h w"], mask: Bool[ndarray, "h w"]) -> UInt8[ndarray, "h w"]:
+    """The picture with everything still painted over in one grey.
+
+    The flow of thin things that move fast before a textured background would else be that of the background.
+    """
+    return np.where(mask, grey, np.uint8(_BACKGROUND_GREY))
 
 
 def _follow(

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from lerobot_msdyn.geometry import axis_angle_to_matrix, se3, transform_points
-from lerobot_msdyn.motion.rigid import fill_gaps, fit_rigid, model_points, residuals
+from lerobot_msdyn.motion.gaps import fill_gaps
+from lerobot_msdyn.motion.rigid import fit_rigid, model_points, residuals
 
 
 def worst_error(motions: Tensor, truth: Tensor, points: Tensor) -> float:
