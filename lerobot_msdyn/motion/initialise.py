@@ -75,7 +75,9 @@ def object_motion(
     xyz, valid = xyz[kept], valid[kept]
     confidence, instance = tracks.confidence[kept], tracks.instance[kept]
     canonical = canonical_frame(valid, instance)
-    part = split_rigid_parts(xyz, valid, confidence, instance, max_parts)
+    in_camera = transform_points(camera.camera_from_world, xyz.transpose(0, 1))[..., 2].T[valid]
+    pixel_m = float(in_camera.median() / camera.intrinsics[0, 0, 0])
+    part = split_rigid_parts(xyz, valid, confidence, instance, max_parts, pixel_m)
     level, points = initialise_objects(xyz, valid, confidence, part, canonical)
     return ObjectMotion(level, canonical, points, part, instance)
 

@@ -22,6 +22,7 @@ from lerobot_msdyn.priors.tracks import flow_tracks
 from lerobot_msdyn.priors.types import PointTracks
 
 MAX_INSTANCES = 8
+_MAX_WIDTH = 320  # px
 _MEDIAN_SAMPLES = 60  # frames over which medians are taken
 _NOISE_FLOOR = 1.0  # CIE Lab units
 _TRACK_RESTART = 10  # frames, of the tracks that vote
@@ -70,11 +71,30 @@ def moving_instances(
     """Instance of every pixel: 0 = static, 1, 2, ... = things that move at some time of the clip, largest first.
 
     At most 8 instances, each followed by optical flow so that it keeps its number when it touches another. `median`
-    and `noise` are those of `temporal_median`.
+    and `noise` are those of `temporal_median`. Videos wider than 320 px are looked at in that width.
     """
-    frames = rgb.cpu().numpy()
-    moving = _moving_pixels(frames, median.cpu().numpy(), noise.cpu().numpy())
-    return torch.from_numpy(_number(_linked(frames, moving)))
+    height, width = noise.shape
+    size = (min(width, _MAX_WIDTH), max(1, round(height * min(1.0, _MAX_WIDTH / width))))
+
+    def small(image: ndarray) -> ndarray:
+        return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+    frames = np.stack([small(frame) for frame in rgb.cpu().numpy()])
+    moving = _moving_pixels(frames, small(median.cpu().numpy()), small(noise.cpu().numpy()))
+    numbers = _number(_linked(frames, moving))
+    if size == (width, height):
+        return torch.from_numpy(numbers)
+    return torch.from_numpy(np.stack([_enlarged(frame, (width, height)) for frame in numbers]))
+
+
+def _enlarged(numbers: UInt8[ndarray, "h w"], size: tuple[int, int]) -> UInt8[ndarray, "H W"]:
+    """Numbered regions at a larger size (width, height), with smooth outlines."""
+    out, most = np.zeros(size[::-1], np.uint8), np.full(size[::-1], 0.5, np.float32)
+    for number in np.unique(numbers[numbers > 0]):
+        share = cv2.resize((numbers == number).astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
+        out[share > most] = number
+        most = np.maximum(most, share)
+    return out
 
 
 def _spread(frames: int) -> Int[ndarray, " s"]:

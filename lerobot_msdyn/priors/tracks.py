@@ -20,10 +20,10 @@ from torch import Tensor
 from lerobot_msdyn.priors.patches import Patches, cut, register, sample
 from lerobot_msdyn.priors.types import PointTracks
 
-_POINTS_PER_INSTANCE = 400  # at a time; instances too small for that get a finer grid, down to 2 px
+_FEW_POINTS, _MANY_POINTS = 400, 1500  # per instance and frame: with fewer the grid is finer, with more it is coarser
 _EDGE_MARGIN_PX = 2  # of the first points of a track from the edge of their instance ...
 _SMALL_INSTANCE_PX = 1000  # ... and half of that in instances smaller than this
-_BACKGROUND_GREY = 128
+_BACKGROUND_GREY = 128  # of what does not move, while flow is computed
 _SMOOTH_WINDOW = 9  # px, over which an instance's flow is averaged for the second guess
 _STALE_NCC = 0.8  # below this the anchor no longer looks like the point: take a newer one ...
 _MIN_ANCHOR_AGE = 4  # ... unless it is younger than this, in frames
@@ -93,7 +93,7 @@ def flow_tracks(
 ) -> PointTracks:
     """Follow points of the moving instances through a clip, forward and backward in time.
 
-    Points start on a grid (`grid` px of the working image, finer on small instances) inside the instances, 2 px from
+    Points start on a grid (`grid` px of the working image, finer on small instances, coarser on very large ones), 2 px from
     their edges, at the first frame and then every `restart_every` frames wherever no point is being followed. Frames
     wider than `max_width` are tracked at that width; positions are returned in pixels of `rgb`. A point is visible
     where forward and backward flow agree to 1 px + 1 %, its patch correlates with its anchor's by more than `min_ncc`
@@ -186,7 +186,7 @@ def _new_points(labels: UInt8[ndarray, "h w"], followed: Float32[ndarray, "n 2"]
     for instance in np.unique(labels[labels > 0]):
         mask = (labels == instance).astype(np.uint8)
         area = int(mask.sum())
-        spacing = int(np.clip(math.sqrt(area / _POINTS_PER_INSTANCE), 2, grid))
+        spacing = int(np.clip(math.sqrt(area / _FEW_POINTS), 2, max(grid, math.sqrt(area / _MANY_POINTS))))
         margin = _EDGE_MARGIN_PX if area > _SMALL_INSTANCE_PX else 1
         inside = cv2.erode(mask, _square(margin), borderType=cv2.BORDER_CONSTANT, borderValue=0)
         covered = cv2.dilate(occupied, _square(spacing - 1))

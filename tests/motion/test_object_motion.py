@@ -47,10 +47,10 @@ def test_the_worlds_origin_does_not_matter(tumbling) -> None:
     torch.testing.assert_close(far.displacements, near.displacements, atol=1e-5, rtol=0)
 
 
-def test_a_body_that_is_lost_is_held(tumbling, late) -> None:
+def test_a_body_that_is_lost_is_held(tumbling, resting) -> None:
     valid = torch.ones(120, 24, dtype=torch.bool)
     valid[:60, 15:] = False
-    level, points = fit([tumbling, late], 0, valid)
+    level, points = fit([tumbling, resting], 0, valid)
     carried = moved(level, 0, points[:60])
     torch.testing.assert_close(carried[14], tumbling.xyz[:, 14], atol=1e-5, rtol=0)
     torch.testing.assert_close(carried[15:], carried[14].expand(9, -1, -1), atol=1e-6, rtol=0)

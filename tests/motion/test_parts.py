@@ -48,3 +48,21 @@ def test_no_tracks() -> None:
     none = torch.zeros(0, 24)
     part = split_rigid_parts(torch.zeros(0, 24, 3), none > 0, none, torch.zeros(0, dtype=torch.long))
     assert part.shape == (0,)
+
+
+def test_tracks_that_follow_each_other_in_time_are_one_part(tumbling) -> None:
+    """A rigid body whose first tracks end before the others begin."""
+    valid = torch.zeros(60, 24, dtype=torch.bool)
+    valid[:30, :12], valid[30:, 12:] = True, True
+    part = split_rigid_parts(tumbling.xyz, valid, valid.float(), torch.ones(60, dtype=torch.long))
+    assert part.tolist() == [0] * 60
+
+
+def test_residuals_below_two_pixels_make_no_parts(tumbling) -> None:
+    """Half of the tracks creep away by 3 mm, at 2 mm a pixel."""
+    xyz = tumbling.xyz
+    xyz[:30, :, 0] += torch.linspace(0, 0.003, 24)
+    everywhere = torch.ones(60, 24)
+    instance = torch.ones(60, dtype=torch.long)
+    whole = split_rigid_parts(xyz, everywhere > 0, everywhere, instance, pixel_m=0.002)
+    assert whole.tolist() == [0] * 60

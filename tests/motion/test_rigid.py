@@ -1,12 +1,9 @@
 """Rigid motions of groups of tracks."""
 
-import math
-
 import torch
 from torch import Tensor
 
-from lerobot_msdyn.geometry import axis_angle_to_matrix, se3, transform_points
-from lerobot_msdyn.motion.gaps import fill_gaps
+from lerobot_msdyn.geometry import transform_points
 from lerobot_msdyn.motion.rigid import fit_rigid, model_points, residuals
 
 
@@ -87,24 +84,3 @@ def test_model_and_residuals_of_one_stray_track(tumbling) -> None:
     # its model point is off by 1/24 of the jump everywhere, and by the rest where it jumps
     torch.testing.assert_close(distance[5, 7], torch.tensor(0.23, dtype=torch.float64), atol=1e-4, rtol=0)
     assert distance[6:].max() < 1e-5
-
-
-def test_gaps_are_bridged_inside_and_held_outside() -> None:
-    angle = torch.linspace(0, math.pi / 2, 7)[:, None] * torch.tensor([0.0, 0.0, 1.0])
-    pivot = torch.tensor([1.0, 2.0, 0.0])
-    shift = torch.linspace(0, 0.6, 7)[:, None] * torch.tensor([1.0, 0.0, 0.0])
-    rotation = axis_angle_to_matrix(angle)
-    truth = se3(rotation, pivot + shift - rotation @ pivot)
-    broken = truth.clone()
-    broken[[0, 3, 4, 6]] = torch.eye(4)
-    accepted = torch.tensor([False, True, True, False, False, True, False])
-    filled = fill_gaps(broken, accepted, pivot)
-    torch.testing.assert_close(filled[1:6], truth[1:6], atol=1e-5, rtol=0)
-    torch.testing.assert_close(filled[0], truth[1])
-    torch.testing.assert_close(filled[6], truth[5])
-
-
-def test_without_any_accepted_frame_nothing_moves() -> None:
-    motions = torch.full((3, 4, 4), 7.0)
-    filled = fill_gaps(motions, torch.zeros(3, dtype=torch.bool), torch.zeros(3))
-    torch.testing.assert_close(filled, torch.eye(4).expand(3, 4, 4))
