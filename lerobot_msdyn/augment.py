@@ -54,6 +54,7 @@ def augment(
 ) -> int:
     """Run the job that the command line described and say how it went; returns the exit code."""
     from lerobot_msdyn.engines import plan, run_local
+    from lerobot_msdyn.provenance import SOURCE_VARIANT
     from lerobot_msdyn.write import OutputDataset, check_place
 
     start = time.perf_counter()
@@ -66,7 +67,7 @@ def augment(
         if not new:
             raise EpisodeError(f"no episode could be augmented; nothing was written. First: {failures[0]}")
         output.finish(new, draccus.dump(config))
-    rendered = sum(bool(episode.videos or episode.images) for episode in new)
+    rendered = sum(episode.provenance.variant != SOURCE_VARIANT for episode in new)
     sys.stdout.write(
         f"{len(episodes) - len(failures)} of {len(episodes)} episodes, {rendered} new ones "
         f"({config.variants} per episode, {', '.join(cameras)}), {time.perf_counter() - start:.0f} s\n"

@@ -268,9 +268,8 @@ def read_depth(
     Raises:
         EpisodeError: a frame is absent or cannot be decoded.
     """
-    info = meta.features[key].get("info") or {}
     if key in meta.video_keys:
-        encoder = DepthEncoderConfig.from_video_info(info)
+        encoder = DepthEncoderConfig.from_video_info(meta.features[key].get("info") or {})
         depth = dequantize_depth(
             _decode_video(meta, index, key, rows, is_depth=True),
             depth_min=encoder.depth_min,
@@ -282,8 +281,7 @@ def read_depth(
         return depth[:, 0].float(), (encoder.depth_min, encoder.depth_max)
     images = [_decode_image(meta, index, key, item, cv2.IMREAD_UNCHANGED) for item in rows[key].to_pylist()]
     depth = torch.from_numpy(np.stack(images).astype(np.float32))
-    unit = 1.0 if info.get("depth_unit") == "m" else MILLIMETRES
-    return depth / unit, (0.0, float("inf"))
+    return depth / depth_units_per_metre(meta, key), (0.0, float("inf"))
 
 
 def _decode_video(meta: LeRobotDatasetMetadata, index: int, key: str, rows: pa.Table, *, is_depth: bool) -> Tensor:
@@ -314,12 +312,17 @@ def _decode_image(meta: LeRobotDatasetMetadata, index: int, key: str, item: dict
     return image
 
 
-def encode_image(image: UInt8[np.ndarray, "h w 3"]) -> bytes:
-    """A colour image as PNG, as LeRobot stores image features."""
-    ok, content = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+def encode_image(image: np.ndarray, suffix: str) -> bytes:
+    """An image file's content: colours uint8 [h,w,3], or depth [h,w] as it is stored."""
+    ok, content = cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image)
     if not ok:
-        raise EpisodeError(f"an image of shape {image.shape} cannot be encoded as PNG")
+        raise EpisodeError(f"an image of shape {image.shape} cannot be encoded as {suffix}")
     return bytes(content.tobytes())
+
+
+def depth_units_per_metre(meta: LeRobotDatasetMetadata, key: str) -> float:
+    """How many of the units in which a depth feature was recorded make a metre (LeRobot's default: millimetres)."""
+    return 1.0 if (meta.features[key].get("info") or {}).get("depth_unit") == "m" else MILLIMETRES
 
 
 def _matrix(rows: pa.Table, key: str) -> Float[Tensor, "t n"] | None:

@@ -78,7 +78,7 @@ def evaluate_nvs(config: EvaluateConfig) -> dict[str, float]:
         for frame, picture in zip(
             frames.tolist(), new_pictures(scene, track(heldout["K"], heldout["c2w"]), frames), strict=True
         ):
-            cv2.imwrite(str(out / f"rgb_{frame:04d}.png"), picture[..., ::-1])
+            cv2.imwrite(str(out / f"rgb_{frame:04d}.png"), picture.rgb[..., ::-1])
             pictures += 1
     seconds["render"] = time.perf_counter() - start
     for stage, value in seconds.items():

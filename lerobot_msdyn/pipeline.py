@@ -8,22 +8,22 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float32, UInt8
 from lerobot.datasets import LeRobotDatasetMetadata
 from torch import Tensor
 
 from lerobot_msdyn.cameras import CameraTrack
 from lerobot_msdyn.config import Recipe
-from lerobot_msdyn.episode import View, read_episode
+from lerobot_msdyn.episode import View, depth_key_of, read_episode
 from lerobot_msdyn.fitting import FitResult, fit
 from lerobot_msdyn.initialisation import initialise
 from lerobot_msdyn.perturbation import draw_offset, draw_rng, look_at_distance, perturb
 from lerobot_msdyn.priors import Priors, estimate_priors
 from lerobot_msdyn.priors.depth import static_depth
 from lerobot_msdyn.provenance import SOURCE_VARIANT, Provenance
-from lerobot_msdyn.quality import fill_holes
+from lerobot_msdyn.quality import HOLE_ALPHA, fill_holes
 from lerobot_msdyn.rendering import render_frames, resized
-from lerobot_msdyn.write import NewEpisode, OutputDataset, to_uint8
+from lerobot_msdyn.write import NewEpisode, OutputDataset
 
 logger = logging.getLogger(__name__)
 
@@ -38,6 +38,14 @@ class Reconstruction:
     priors: Priors
     camera: CameraTrack  # at the size of the recorded video
     distance: float  # m, to the look-at point
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One frame of a new view."""
+
+    rgb: UInt8[np.ndarray, "h w 3"]
+    depth: Float32[np.ndarray, "h w"]  # m, z-depth; 0 where nothing is known, and everywhere if there is no true scale
 
 
 def augment_episode(
@@ -71,7 +79,7 @@ def augment_episode(
             offset, drawn[key] = draw_offset(recipe.perturbation, scene.distance, rng)
             pictures[key] = new_pictures(scene, perturb(scene.camera, offset))
         provenance = Provenance(source.repo_id, index, variant, recipe.seed, drawn, priors)
-        new.append(output.stage(index, variant, pictures, provenance))
+        new.append(output.stage(index, variant, by_feature(source, pictures), provenance))
         progress("", 0.5 / recipe.variants)
     return new
 
@@ -107,16 +115,30 @@ def _one_torch_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def new_pictures(
-    scene: Reconstruction, camera: CameraTrack, frames: Tensor | None = None
-) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+def by_feature(
+    source: LeRobotDatasetMetadata, pictures: dict[str, Iterator[Picture]]
+) -> Iterator[dict[str, np.ndarray]]:
+    """Per time, feature -> picture: the cameras in step, and the depth of those that have a depth feature."""
+    for together in zip(*pictures.values(), strict=True):
+        features: dict[str, np.ndarray] = {}
+        for key, picture in zip(pictures, together, strict=True):
+            features[key] = picture.rgb
+            depth_key = depth_key_of(source, key)
+            if depth_key is not None:
+                features[depth_key] = picture.depth
+        yield features
+
+
+def new_pictures(scene: Reconstruction, camera: CameraTrack, frames: Tensor | None = None) -> Iterator[Picture]:
     """The scene's frames through another camera, holes filled; the share of holes is logged at the end."""
     holes = []
     for rendering in render_frames(scene.result.scene, camera, frames):
-        for rgb, alpha in zip(to_uint8(rendering.rgb), rendering.alpha.cpu().numpy(), strict=True):
-            picture, share = fill_holes(rgb, alpha)
+        drawn = (rendering.rgb.clamp(0, 1) * 255).round().to(torch.uint8)
+        for rgb, alpha, depth in zip(drawn.numpy(), rendering.alpha.numpy(), rendering.depth.numpy(), strict=True):
+            filled, share = fill_holes(rgb, alpha)
             holes.append(share)
-            yield picture
+            known = (alpha >= HOLE_ALPHA) & scene.priors.metric
+            yield Picture(filled, np.where(known, depth, np.float32(0)))
     logger.info("%.1f %% of the pixels were filled in (worst frame %.1f %%)", 100 * np.mean(holes), 100 * max(holes))
 
 

@@ -2,14 +2,13 @@
 
 import os
 import shutil
-from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
 
 import av
 import numpy as np
-from jaxtyping import UInt8, UInt16
-from lerobot.configs import DepthEncoderConfig, RGBEncoderConfig, VideoEncoderConfig
+from lerobot.configs import DepthEncoderConfig, RGBEncoderConfig
+from lerobot.datasets.depth_utils import quantize_depth
 from lerobot.datasets.pyav_utils import write_u16_plane
 from lerobot.datasets.video_utils import decode_video_frames, get_video_duration_in_s
 
@@ -37,31 +36,61 @@ def encoder_of(feature: dict, key: str) -> RGBEncoderConfig | DepthEncoderConfig
         raise OutputError(f"{key}: cannot encode video as its source ({error})") from error
 
 
-def encode_video(
-    frames: Iterable[UInt8[np.ndarray, "h w 3"]], path: Path, fps: int, encoder: VideoEncoderConfig
-) -> int:
-    """Encode frames as they come; returns their number."""
-    return _encode((av.VideoFrame.from_ndarray(frame, format="rgb24") for frame in frames), path, fps, encoder)
+class VideoFile:
+    """An mp4 file that grows frame by frame, encoded as the source was."""
+
+    def __init__(self, path: Path, fps: int, encoder: RGBEncoderConfig | DepthEncoderConfig) -> None:
+        quiet_encoders()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._fps, self._encoder = fps, encoder
+        self._container = av.open(str(path), "w")
+        self._stream: av.VideoStream | None = None
+        self._count = 0
+
+    def __enter__(self) -> "VideoFile":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def add(self, picture: np.ndarray) -> None:
+        """Append colours uint8 [h,w,3], depth float32 [h,w] in m, or depth codes uint16 [h,w] that are quantised."""
+        if picture.ndim == 3:
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+        else:
+            frame = _depth_frame(picture, self._encoder)
+        if self._stream is None:
+            options = self._encoder.get_codec_options(as_strings=True)
+            self._stream = self._container.add_stream(self._encoder.vcodec, self._fps, options=options)
+            self._stream.pix_fmt = self._encoder.pix_fmt
+            self._stream.width, self._stream.height = frame.width, frame.height
+        frame.pts = self._count
+        frame.time_base = Fraction(1, self._fps)
+        self._container.mux(self._stream.encode(frame))
+        self._count += 1
+
+    def close(self) -> None:
+        """Write what the encoder still holds, and the file's index."""
+        if self._stream is not None:
+            self._container.mux(self._stream.encode())
+        self._container.close()
 
 
-def _encode(frames: Iterable[av.VideoFrame], path: Path, fps: int, encoder: VideoEncoderConfig) -> int:
-    quiet_encoders()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    count = 0
-    with av.open(str(path), "w") as container:
-        stream = None
-        for frame in frames:
-            if stream is None:
-                stream = container.add_stream(encoder.vcodec, fps, options=encoder.get_codec_options(as_strings=True))
-                stream.pix_fmt = encoder.pix_fmt
-                stream.width, stream.height = frame.width, frame.height
-            frame.pts = count
-            frame.time_base = Fraction(1, fps)
-            container.mux(stream.encode(frame))
-            count += 1
-        if stream is not None:
-            container.mux(stream.encode())
-    return count
+def _depth_frame(depth: np.ndarray, encoder: RGBEncoderConfig | DepthEncoderConfig) -> av.VideoFrame:
+    codes = depth
+    if depth.dtype != np.uint16:
+        codes = quantize_depth(
+            depth,
+            depth_min=encoder.depth_min,
+            depth_max=encoder.depth_max,
+            shift=encoder.shift,
+            use_log=encoder.use_log,
+            video_backend=None,
+            input_unit="m",
+        )
+    frame = av.VideoFrame.from_ndarray(codes, format=encoder.pix_fmt)
+    write_u16_plane(frame.planes[0], codes)
+    return frame
 
 
 def cut_video(
@@ -122,15 +151,6 @@ def _encode_anew(
     pictures = decode_video_frames(
         source, times, TIMESTAMP_TOLERANCE_S, VIDEO_BACKEND, return_uint8=True, is_depth=is_depth
     )
-    if isinstance(encoder, DepthEncoderConfig):
-        codes = pictures[:, 0].numpy().astype(np.uint16)
-        _encode((_depth_frame(code, encoder) for code in codes), path, fps, encoder)
-    else:
-        encode_video((picture.permute(1, 2, 0).numpy() for picture in pictures), path, fps, encoder)
-
-
-def _depth_frame(codes: UInt16[np.ndarray, "h w"], encoder: DepthEncoderConfig) -> av.VideoFrame:
-    """A video frame of depth codes that are quantised already."""
-    frame = av.VideoFrame.from_ndarray(codes, format=encoder.pix_fmt)
-    write_u16_plane(frame.planes[0], codes)
-    return frame
+    with VideoFile(path, fps, encoder) as file:
+        for picture in pictures:
+            file.add(picture[0].numpy().astype(np.uint16) if is_depth else picture.permute(1, 2, 0).numpy())

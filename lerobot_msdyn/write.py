@@ -9,7 +9,7 @@ Everything is prepared in a hidden folder beside the output, which appears by on
 
 import copy
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,25 +17,22 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-import torch
-from jaxtyping import UInt8
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.datasets.compute_stats import (
     auto_downsample_height_width,
     compute_episode_stats,
-    get_feature_stats,
     sample_indices,
 )
 from lerobot.datasets.io_utils import write_info, write_tasks
 from lerobot.datasets.utils import update_chunk_file_indices
 from lerobot.datasets.video_utils import concatenate_video_files, get_video_duration_in_s
 
-from lerobot_msdyn.episode import encode_image, inside_root, read_colour, read_depth, read_rows
+from lerobot_msdyn.episode import depth_units_per_metre, inside_root, read_colour, read_depth, read_rows
 from lerobot_msdyn.errors import OutputError
 from lerobot_msdyn.provenance import Provenance, write_provenance
-from lerobot_msdyn.video import cut_video, encode_video, encoder_of
+from lerobot_msdyn.staging import StagedPictures, Stats, image_stats, stage_pictures
+from lerobot_msdyn.video import cut_video, encoder_of
 
-Stats = dict[str, dict[str, np.ndarray]]
 MEGABYTE = 1024**2
 
 
@@ -45,9 +42,7 @@ class NewEpisode:
 
     source_index: int
     provenance: Provenance
-    videos: dict[str, Path] = field(default_factory=dict)  # re-rendered video features
-    images: dict[str, Path] = field(default_factory=dict)  # re-rendered image features: folder of PNG files
-    stats: Stats = field(default_factory=dict)  # of the re-rendered features
+    pictures: StagedPictures = field(default_factory=StagedPictures)  # none for a copy of the source's episode
 
 
 class OutputDataset:
@@ -77,34 +72,12 @@ class OutputDataset:
         shutil.rmtree(self._partial, ignore_errors=True)
 
     def stage(
-        self,
-        index: int,
-        variant: int,
-        pictures: Mapping[str, Iterable[UInt8[np.ndarray, "h w 3"]]],
-        provenance: Provenance,
+        self, index: int, variant: int, frames: Iterable[Mapping[str, np.ndarray]], provenance: Provenance
     ) -> NewEpisode:
-        """Encode the new pictures of one episode, camera by camera, as they are drawn."""
+        """Encode the new pictures of one episode as they are drawn (see `stage_pictures`)."""
         folder = self._partial / "staged" / f"episode_{index:06d}_variant_{variant:02d}"
-        length = int(self.source.episodes[index]["length"])
-        videos, images, stats = {}, {}, {}
-        for key, frames in pictures.items():
-            sampler = _Sampler(length)
-            if key in self.source.video_keys:
-                path = folder / f"{key}.mp4"
-                encoder = encoder_of(self.source.features[key], key)
-                count = encode_video(sampler.watch(frames), path, self.source.fps, encoder)
-                videos[key] = path
-            else:
-                path = folder / key
-                path.mkdir(parents=True)
-                count = 0
-                for count, frame in enumerate(sampler.watch(frames), start=1):
-                    (path / f"frame_{count - 1:06d}.png").write_bytes(encode_image(frame))
-                images[key] = path
-            if count != length:
-                raise OutputError(f"episode {index}, {key}: {count} pictures were drawn; expected {length}")
-            stats[key] = image_stats(np.stack(sampler.samples))
-        return NewEpisode(index, provenance, videos, images, stats)
+        pictures = stage_pictures(self.source, folder, frames, int(self.source.episodes[index]["length"]))
+        return NewEpisode(index, provenance, pictures)
 
     def finish(self, episodes: list[NewEpisode], recipe_yaml: str) -> None:
         """Put the dataset together and move it to its place.
@@ -133,26 +106,6 @@ def check_place(source: LeRobotDatasetMetadata, root: Path) -> None:
         )
     if root.exists():
         raise OutputError(f"{root} exists already; remove it or choose another --new_repo_id or --new_root")
-
-
-class _Sampler:
-    """Keeps the frames from which LeRobot computes image statistics, while they pass by."""
-
-    def __init__(self, length: int) -> None:
-        self._wanted = set(sample_indices(length))
-        self.samples: list[np.ndarray] = []
-
-    def watch(self, frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
-        for i, frame in enumerate(frames):
-            if i in self._wanted:
-                self.samples.append(auto_downsample_height_width(frame.transpose(2, 0, 1)))
-            yield frame
-
-
-def image_stats(samples: np.ndarray, scale: float = 255.0) -> dict[str, np.ndarray]:
-    """LeRobot's statistics per channel of sampled frames [n,c,h,w], divided by `scale`; shapes [c,1,1]."""
-    stats = get_feature_stats(samples, axis=(0, 2, 3), keepdims=True)
-    return {name: value if name == "count" else np.squeeze(value / scale, axis=0) for name, value in stats.items()}
 
 
 class _Files:
@@ -236,9 +189,9 @@ class _Assembly:
             group: list[tuple[int, Path]] = []
             size = 0
             for i, episode in enumerate(episodes):
-                if (key in episode.videos) != rendered:
+                if (key in episode.pictures.videos) != rendered:
                     continue
-                path = episode.videos[key] if rendered else self._copied_video(key, episode.source_index)
+                path = episode.pictures.videos[key] if rendered else self._copied_video(key, episode.source_index)
                 if group and size + path.stat().st_size > self.meta.video_files_size_in_mb * MEGABYTE:
                     self._write_video_file(key, group, files.take(), places)
                     group, size = [], 0
@@ -291,7 +244,7 @@ class _Assembly:
                 chunk, file = files.add(rows)
                 if episode.source_index not in copied_stats:
                     copied_stats = {episode.source_index: self._copied_stats(episode.source_index)}
-                stats = copied_stats[episode.source_index] | self._row_stats(rows) | episode.stats
+                stats = copied_stats[episode.source_index] | self._row_stats(rows) | episode.pictures.stats
                 self.meta.save_episode(
                     i,
                     rows.num_rows,
@@ -308,10 +261,8 @@ class _Assembly:
             "episode_index": [index] * rows.num_rows,
             "index": range(start, start + rows.num_rows),
         }
-        for key, folder in episode.images.items():
-            new_columns[key] = [
-                {"bytes": path.read_bytes(), "path": path.name} for path in sorted(folder.glob("frame_*.png"))
-            ]
+        for key, folder in episode.pictures.images.items():
+            new_columns[key] = [{"bytes": path.read_bytes(), "path": path.name} for path in sorted(folder.iterdir())]
         for key, values in new_columns.items():
             position = rows.column_names.index(key)
             rows = rows.set_column(
@@ -336,15 +287,9 @@ class _Assembly:
         for key in self.source.camera_keys:
             if key in self.source.depth_keys:
                 depth, _ = read_depth(self.source, index, key, rows)
-                unit = 1.0 if (self.source.features[key].get("info") or {}).get("depth_unit") == "m" else 1000.0
-                samples, scale = depth[chosen][:, None].numpy() * unit, 1.0
+                samples, scale = depth[chosen][:, None].numpy() * depth_units_per_metre(self.source, key), 1.0
             else:
                 samples = read_colour(self.source, index, key, rows)[chosen].permute(0, 3, 1, 2).numpy()
                 scale = 255.0
             stats[key] = image_stats(np.stack([auto_downsample_height_width(sample) for sample in samples]), scale)
         return stats
-
-
-def to_uint8(rgb: torch.Tensor) -> np.ndarray:
-    """Colours 0..1 as bytes."""
-    return (rgb.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()

@@ -30,9 +30,9 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def image_desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two episodes whose pictures are image features, inside the parquet files."""
+    """Two episodes whose pictures are image features, inside the parquet files: front and wrist, with depth."""
     root = tmp_path_factory.mktemp("image_desk") / "desk"
-    write_dataset(_scenes(2), "local/desk", root, cameras=["front", "wrist"], image_dtype="image")
+    write_dataset(_scenes(2), "local/desk", root, cameras=["front", "wrist"], depth=True, image_dtype="image")
     return root
 
 

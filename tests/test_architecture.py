@@ -12,7 +12,18 @@ ONLY_IN = {
     "gsplat": {"render"},
     "datatrove": {"engines"},
     "rerun": {"viewer"},
-    "lerobot": {"episode", "synthetic", "video", "write", "pipeline", "engines", "augment", "evaluate", "training"},
+    "lerobot": {
+        "episode",
+        "synthetic",
+        "video",
+        "staging",
+        "write",
+        "pipeline",
+        "engines",
+        "augment",
+        "evaluate",
+        "training",
+    },
 }
 
 

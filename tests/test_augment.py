@@ -52,6 +52,10 @@ def test_output_is_the_source_seen_from_elsewhere(desk: Path, augmented: Path) -
                 assert torch.equal(a[key], b[key]), (number, i, key)
             assert a["task"] == b["task"]
             changed.append(float((a[FRONT] - b[FRONT]).abs().mean()))
+            assert torch.equal(a[f"{FRONT}_depth"], b[f"{FRONT}_depth"]) == (number % 3 == 0), (number, i)
+            known = b[f"{FRONT}_depth"] > 15  # mm; missing pixels come back as 10
+            assert known.float().mean() > 0.5
+            assert 300 < b[f"{FRONT}_depth"][known].median() < 3000
             position += 1
         if number % 3 == 0:
             assert max(changed) == 0

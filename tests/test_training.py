@@ -41,7 +41,7 @@ def test_lerobot_train_takes_the_output(tmp_path: Path) -> None:
     root = tmp_path / "new"
     with OutputDataset(source, "local/new", root) as output:
         rgb = read_colour(source, 0, FRONT, read_rows(source, 0)).numpy()
-        made = output.stage(0, 0, {FRONT: iter(rgb)}, Provenance("local/desk", 0, 0, 0))
+        made = output.stage(0, 0, ({FRONT: frame} for frame in rgb), Provenance("local/desk", 0, 0, 0))
         output.finish([NewEpisode(0, Provenance("local/desk", 0, -1, 0)), made], "")
     done = subprocess.run(
         [

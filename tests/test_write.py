@@ -8,10 +8,11 @@ import pytest
 import torch
 from lerobot.datasets import LeRobotDataset
 
-from lerobot_msdyn.episode import open_source, read_colour, read_rows
+from lerobot_msdyn.episode import open_source, read_colour, read_depth, read_rows
 from lerobot_msdyn.errors import OutputError
 from lerobot_msdyn.provenance import SOURCE_VARIANT, Provenance
-from lerobot_msdyn.write import NewEpisode, OutputDataset, image_stats
+from lerobot_msdyn.staging import image_stats
+from lerobot_msdyn.write import NewEpisode, OutputDataset
 
 FRONT = "observation.images.front"
 RENUMBERED = ("index", "episode_index")
@@ -37,7 +38,7 @@ def write_upside_down(root: Path, out: Path, indices: tuple[int, ...]) -> list[N
         for index in indices:
             rgb = read_colour(source, index, FRONT, read_rows(source, index)).flip(1).numpy()
             drawn = Provenance("local/desk", index, 0, 0, {FRONT: {"azimuth_deg": 1.5}})
-            episodes += [copied(index), output.stage(index, 0, {FRONT: iter(rgb)}, drawn)]
+            episodes += [copied(index), output.stage(index, 0, ({FRONT: frame} for frame in rgb), drawn)]
         output.finish(episodes, "variants: 1\n")
     return episodes
 
@@ -54,8 +55,10 @@ def assert_same_but_for_new_pictures(
             assert (new["index"], new["episode_index"]) == (position, number)
             for key in set(old) - set(RENUMBERED):
                 where = (number, i, key)
-                if key in episode.videos or key in episode.images:
-                    assert (old[key].flip(1) - new[key]).abs().mean() < (0.05 if episode.videos else 1e-6), where
+                if key in episode.pictures.videos or key in episode.pictures.images:
+                    assert (old[key].flip(1) - new[key]).abs().mean() < (0.05 if episode.pictures.videos else 1e-6), (
+                        where
+                    )
                 elif isinstance(old[key], torch.Tensor):
                     assert torch.equal(old[key], new[key]), where
                 else:
@@ -79,6 +82,24 @@ def test_only_the_new_pictures_differ(
     assert (output.meta.fps, output.meta.robot_type) == (source.meta.fps, source.meta.robot_type)
     assert fingerprint(root) == before
     assert [path.name for path in tmp_path.iterdir()] == ["new"]
+
+
+@pytest.mark.parametrize("which", ["desk", "image_desk"])
+def test_new_depth_comes_back_in_metres(which: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    root = request.getfixturevalue(which)
+    source = open_source("local/desk", root)
+    key = f"{FRONT}_depth"
+    rows = read_rows(source, 1)
+    rgb = read_colour(source, 1, FRONT, rows).numpy()
+    depth = 0.5 * read_depth(source, 1, key, rows)[0].numpy()
+    with OutputDataset(source, "local/new", tmp_path / "new") as output:
+        frames = ({FRONT: colours, key: metres} for colours, metres in zip(rgb, depth, strict=True))
+        output.finish([output.stage(1, 0, frames, copied(1).provenance)], "")
+    new = open_source("local/new", tmp_path / "new")
+    again = read_depth(new, 0, key, read_rows(new, 0))[0].numpy()
+    assert np.abs(again - depth).max() < 0.003  # the step of LeRobot's codes
+    old_stats, new_stats = source.stats[key]["mean"], new.stats[key]["mean"]
+    assert 0.4 < float(np.squeeze(new_stats)) / float(np.squeeze(old_stats)) < 0.6
 
 
 def test_parquet_rows_are_the_sources(desk: Path, tmp_path: Path) -> None:
@@ -138,8 +159,8 @@ def test_an_error_leaves_nothing_behind(desk: Path, tmp_path: Path) -> None:
 
     def write() -> None:
         with OutputDataset(source, "local/new", tmp_path / "new") as output:
-            output.stage(0, 0, {FRONT: iter([np.zeros((48, 64, 3), np.uint8)])}, copied(0).provenance)
+            output.stage(0, 0, [{FRONT: np.zeros((48, 64, 3), np.uint8)}], copied(0).provenance)
 
-    with pytest.raises(OutputError, match=r"episode 0, observation.images.front: 1 pictures were drawn; expected 12"):
+    with pytest.raises(OutputError, match="episode_000000_variant_00: 1 frames were drawn; expected 12"):
         write()
     assert list(tmp_path.iterdir()) == []

@@ -18,6 +18,8 @@ from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.priors.change import changes, to_lab
+from lerobot_msdyn.priors.patches import sample
+from lerobot_msdyn.priors.stabilise import camera_sway, to_frames, to_reference
 from lerobot_msdyn.priors.tracks import flow_tracks
 from lerobot_msdyn.priors.types import PointTracks
 
@@ -33,6 +35,7 @@ _SAME_TEXTURE = 8.0  # mean difference of grey levels, apart from brightness, up
 _SAME_BRIGHTNESS = 8.0  # difference of mean grey levels that is allowed at the same place ...
 _CARRIED_BRIGHTNESS = 30.0  # ... and on a surface that may have turned in the light
 _HOME_PATCH = 7  # px
+_TEXTURED = 1e-3  # smaller eigenvalue of the structure tensor, at which a track's vote counts half
 _TRUSTED_FRAMES = 20  # a track's vote grows with its life up to this
 _VOTE_SIGMA_PX = 3.0  # how far a track's vote reaches
 _MIN_VOTE = 0.2  # of one track at the pixel itself
@@ -80,8 +83,15 @@ def moving_instances(
         return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
     frames = np.stack([small(frame) for frame in rgb.cpu().numpy()])
-    moving = _moving_pixels(frames, small(median.cpu().numpy()), small(noise.cpu().numpy()))
-    numbers = _number(_linked(frames, moving))
+    empty, spread = small(median.cpu().numpy()), small(noise.cpu().numpy())
+    sway = camera_sway(frames, empty)
+    if sway is not None:
+        frames = to_reference(frames, sway)
+        steady, steady_noise = temporal_median(torch.from_numpy(frames))
+        empty, spread = steady.numpy(), steady_noise.numpy()
+    numbers = _number(_linked(frames, _moving_pixels(frames, empty, spread)))
+    if sway is not None:
+        numbers = to_frames(numbers, sway)
     if size == (width, height):
         return torch.from_numpy(numbers)
     return torch.from_numpy(np.stack([_enlarged(frame, (width, height)) for frame in numbers]))
@@ -105,7 +115,8 @@ def _moving_pixels(
     frames: UInt8[ndarray, "t h w 3"], median: UInt8[ndarray, "h w 3"], noise: Float32[ndarray, "h w"]
 ) -> Bool[ndarray, "t h w"]:
     """Pixels that show something that moves at some time of the clip, even while it rests."""
-    region = _ever_changing(changes(frames, median, noise))
+    changed = changes(frames, median, noise)
+    region = _ever_changing(changed)
     if not region.any():
         return np.zeros(frames.shape[:3], bool)
     everywhere = torch.from_numpy(region.astype(np.uint8)).expand(len(frames), -1, -1).contiguous()
@@ -115,7 +126,7 @@ def _moving_pixels(
     empty = ~region | ((for_empty > 2 * for_moving) & (for_empty > audible))
     known = empty.sum(0) >= _MIN_EMPTY_FRAMES
     background = _median_where(frames, empty, median)
-    voted = (for_moving > for_empty) & (for_moving > audible)
+    voted = np.where(for_moving + for_empty > audible, for_moving > for_empty, changed)
     moving = np.where(known, changes(frames, background, noise), voted) & region
     return np.stack([_tidy(mask) for mask in moving])
 
@@ -157,10 +168,22 @@ def _vote(
     returns = _times_alike(images, np.broadcast_to(home[:, None], xy.shape), patch, elsewhere, _SAME_BRIGHTNESS)
     carried = _times_alike(images, xy, patch, elsewhere & visible, _CARRIED_BRIGHTNESS)
     dragged = strays & rests & ((returns >= _MIN_ALIKE_FRAMES) | (carried < _MIN_ALIKE_FRAMES))
-    weight = np.minimum(visible.sum(1) / _TRUSTED_FRAMES, 1)[:, None]
+    weight = (np.minimum(visible.sum(1) / _TRUSTED_FRAMES, 1) * _texture(images, xy, visible))[:, None]
     for_moving = weight * (visible & (strays & ~dragged)[:, None])
     for_empty = weight * (at_home & (~strays | dragged)[:, None])
     return _density(xy, for_moving, frames.shape[1:3]), _density(xy, for_empty, frames.shape[1:3])
+
+
+def _texture(
+    images: list[ndarray], xy: Float32[ndarray, "n t 2"], visible: Bool[ndarray, "n t"]
+) -> Float32[ndarray, " n"]:
+    """How well each point can be followed, 0..1: where there is no texture, flow is that of the neighbourhood."""
+    best = np.zeros(len(xy), np.float32)
+    for t, image in enumerate(images):
+        rows = np.nonzero(visible[:, t])[0]
+        corners = cv2.cornerMinEigenVal(image / np.float32(255), 7, ksize=3)
+        best[rows] = np.maximum(best[rows], sample(corners[..., None], xy[rows, t])[:, 0])
+    return best / (best + _TEXTURED)
 
 
 def _rest_patches(
