@@ -17,6 +17,7 @@ from lerobot_msdyn.priors.types import PointTracks
 
 _MIN_SEEN = 3  # frames, and 5 % of the clip, in which a track must be seen
 _MIN_SEEN_SHARE = 0.05
+_MAX_TRACKS = 1500  # of an instance that are used, the longest ones
 _VOTERS = 5  # tracks that decide the part of a point
 _CHUNK = 4096  # points whose distances to all tracks are held at a time
 
@@ -69,8 +70,8 @@ def object_motion(
         max_parts: bound on the rigid parts of one instance.
     """
     xyz, valid = lift_tracks(tracks, depth, camera)
-    kept = valid.sum(1) >= max(_MIN_SEEN, _MIN_SEEN_SHARE * valid.shape[1])
-    if not kept.any():
+    kept = _longest(valid, tracks.instance)
+    if len(kept) == 0:
         return None
     xyz, valid = xyz[kept], valid[kept]
     confidence, instance = tracks.confidence[kept], tracks.instance[kept]
@@ -80,6 +81,17 @@ def object_motion(
     part = split_rigid_parts(xyz, valid, confidence, instance, max_parts, pixel_m)
     level, points = initialise_objects(xyz, valid, confidence, part, canonical)
     return ObjectMotion(level, canonical, points, part, instance)
+
+
+def _longest(valid: Bool[Tensor, "n t"], instance: Int[Tensor, " n"]) -> Int[Tensor, " m"]:
+    """The tracks of each instance that are seen longest, without those that are hardly seen."""
+    seen = valid.sum(1)
+    enough = seen >= max(_MIN_SEEN, _MIN_SEEN_SHARE * valid.shape[1])
+    best = [torch.zeros(0, dtype=torch.long)]
+    for label in instance.unique():
+        rows = (enough & (instance == label)).nonzero()[:, 0]
+        best.append(rows[seen[rows].argsort(descending=True, stable=True)[:_MAX_TRACKS]].sort().values)
+    return torch.cat(best)
 
 
 def canonical_frame(valid: Bool[Tensor, "n t"], instance: Int[Tensor, " n"]) -> int:

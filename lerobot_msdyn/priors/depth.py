@@ -58,10 +58,10 @@ def table_plane_depth(
     wall = _WALL * height_m / math.sin(tilt)
     rows = torch.where(descent > height_m / wall, height_m / descent.clamp(min=1e-6), wall)
     depth = rows[None, :, None].repeat(frames, 1, width)
-    for instance in instances.unique().tolist():
+    for instance in range(1, int(instances.max()) + 1):
         mask = instances == instance
-        if instance > 0:
-            depth[mask] = _standing(mask, rows)[:, None, None].expand_as(depth)[mask]
+        if bool(mask.any()):
+            depth = torch.where(mask, _standing(mask, rows)[:, None, None], depth)
     return depth
 
 

@@ -20,7 +20,7 @@ from torch import Tensor
 from lerobot_msdyn.priors.patches import Patches, cut, register, sample
 from lerobot_msdyn.priors.types import PointTracks
 
-_FEW_POINTS, _MANY_POINTS = 400, 1500  # per instance and frame: with fewer the grid is finer, with more it is coarser
+_FEW_POINTS, _MANY_POINTS = 400, 1500  # per instance and frame; for fewer the grid is finer, for more coarser
 _EDGE_MARGIN_PX = 2  # of the first points of a track from the edge of their instance ...
 _SMALL_INSTANCE_PX = 1000  # ... and half of that in instances smaller than this
 _BACKGROUND_GREY = 128  # of what does not move, while flow is computed
@@ -93,12 +93,12 @@ def flow_tracks(
 ) -> PointTracks:
     """Follow points of the moving instances through a clip, forward and backward in time.
 
-    Points start on a grid (`grid` px of the working image, finer on small instances, coarser on very large ones), 2 px from
-    their edges, at the first frame and then every `restart_every` frames wherever no point is being followed. Frames
-    wider than `max_width` are tracked at that width; positions are returned in pixels of `rgb`. A point is visible
-    where forward and backward flow agree to 1 px + 1 %, its patch correlates with its anchor's by more than `min_ncc`
-    and it lies on its instance. Tracks seen in fewer than max(3, 2 %) of the frames are dropped. Confidence is
-    exp(-fb²/2) times the correlation.
+    Points start on a grid (`grid` px of the working image; finer on small instances, coarser on very large ones),
+    2 px from the edges of their instance, at the first frame and then every `restart_every` frames wherever no point
+    is being followed. Frames wider than `max_width` are tracked at that width; positions are returned in pixels of
+    `rgb`. A point is visible where forward and backward flow agree to 1 px + 1 %, its patch correlates with its
+    anchor's by more than `min_ncc` and it lies on its instance. Tracks seen in fewer than max(3, 2 %) of the frames are
+    dropped. Confidence is exp(-fb²/2) times the correlation.
     """
     frames, height, width = instances.shape
     size = (min(width, max_width), max(1, round(height * min(1.0, max_width / width))))

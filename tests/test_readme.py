@@ -1,0 +1,76 @@
+"""The README's commands do what it says, as they stand there."""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from lerobot_msdyn.synthetic import make_scene
+from lerobot_msdyn.synthetic.dataset import write_dataset
+
+PROJECT = Path(__file__).parent.parent
+IN_CI = {"make demo", "make test"}  # .ci/run
+BY_THE_WHEEL_TEST = {"pip install ."}
+# What keeps the training short and offline; the README's command is run with these behind it.
+SMALL_ACT = (
+    "--policy.device=cpu",
+    "--policy.pretrained_backbone_weights=null",
+    "--policy.chunk_size=4",
+    "--policy.n_action_steps=4",
+    "--policy.dim_model=32",
+    "--policy.n_heads=2",
+    "--policy.dim_feedforward=32",
+    "--policy.n_encoder_layers=1",
+    "--policy.n_vae_encoder_layers=1",
+    "--policy.latent_dim=4",
+    "--batch_size=2",
+    "--steps=2",
+    "--num_workers=0",
+    "--log_freq=1",
+    "--save_checkpoint=false",
+    "--wandb.enable=false",
+    "--dataset.video_backend=pyav",
+)
+
+
+def commands() -> list[str]:
+    blocks = re.findall(r"```sh\n(.*?)```", (PROJECT / "README.md").read_text(), re.DOTALL)
+    return [line for block in blocks for line in block.splitlines() if line.strip()]
+
+
+def test_every_command_is_run_somewhere() -> None:
+    ci = (PROJECT / ".ci" / "run").read_text().splitlines()
+    assert set(ci) >= IN_CI
+    assert set(commands()) - IN_CI - BY_THE_WHEEL_TEST == {augment_command(), train_command()}
+
+
+def augment_command() -> str:
+    return next(command for command in commands() if "lerobot_msdyn.augment" in command)
+
+
+def train_command() -> str:
+    return next(command for command in commands() if command.startswith("lerobot-train"))
+
+
+def run(command: list[str], home: Path) -> str:
+    program = Path(sys.executable)
+    command[0] = str(program if command[0] == "python" else program.with_name(command[0]))
+    environment = os.environ | {"HF_LEROBOT_HOME": str(home), "HF_HUB_OFFLINE": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=400, env=environment, cwd=home)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout + done.stderr
+
+
+@pytest.mark.slow
+def test_augment_and_train(tmp_path: Path) -> None:
+    write_dataset([make_scene("push", 0, 10, 64, 48)], "local/ds", tmp_path / "local" / "ds")
+    said = run(shlex.split(augment_command()), tmp_path)
+    assert "1 of 1 episodes, 2 new ones" in said
+    assert (tmp_path / "local" / "ds_msdyn" / "meta" / "info.json").is_file()
+    said = run([*shlex.split(train_command()), f"--output_dir={tmp_path / 'run'}", *SMALL_ACT], tmp_path)
+    assert "dataset.num_episodes=3" in said
+    assert "End of training" in said
