@@ -33,6 +33,7 @@ from lerobot_msdyn.render.types import COVARIANCE_BLUR, MIN_ALPHA
 
 WORKLOADS = {"W1": (20_000, 320, 240), "W2": (60_000, 640, 480), "W3": (5_000, 160, 120)}  # Gaussians, px, px
 LEAST_RATIO = {"W1": 20.0, "W2": 17.0}  # forward and backward, 8 channels, 1 thread
+VECTOR_OPERATIONS = {"composite_forward": 28, "composite_backward": 48}  # per drawn pixel at 8 channels, by hand count
 SLOWER_THAN_BASELINE = 1.25  # of the ratio to the reference
 BASELINE = Path(__file__).with_suffix(".json")
 
@@ -165,7 +166,21 @@ def cost_split(name: str, channels: int) -> dict[str, float]:
     finally:
         cpu_backend.run = original
     split = {kernel: round(min(values), 3) for kernel, values in times.items()}
-    return {**split, "memory_mb": round(max(sizes.values()), 1), "pixels_drawn_millions": drawn_pixels(load)}
+    pixels, rate = drawn_pixels(load), lane_operations_per_ms()
+    peak = {
+        f"{kernel}_share_of_peak": round(pixels * 1e6 * operations / rate / split[kernel], 2)
+        for kernel, operations in VECTOR_OPERATIONS.items()
+    }
+    return {**split, **peak, "memory_mb": round(max(sizes.values()), 1), "pixels_drawn_millions": pixels}
+
+
+def lane_operations_per_ms() -> float:
+    """Vector operations, counted by lane, that one thread can do: the multiply-adds of a matrix product, the best of 9.
+
+    With it, the share of the peak is that of an ideal kernel that only blends the pixels that are drawn.
+    """
+    a = torch.rand(768, 768)
+    return len(a) ** 3 / min(timed(lambda: a @ a)[1] for _ in range(9))
 
 
 def drawn_pixels(load: Workload) -> float:
