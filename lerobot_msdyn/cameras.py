@@ -42,10 +42,6 @@ class CameraTrack:
         """The camera at some of its frames."""
         return replace(self, intrinsics=self.intrinsics[frames], world_from_camera=self.world_from_camera[frames])
 
-    def to(self, device: torch.device | str) -> "CameraTrack":
-        """The same camera on a device."""
-        return replace(self, intrinsics=self.intrinsics.to(device), world_from_camera=self.world_from_camera.to(device))
-
 
 def intrinsics_from_fov(width: int, height: int, horizontal_fov_deg: float) -> Float[Tensor, "3 3"]:
     """Pinhole matrix of a centred camera with square pixels and the given horizontal field of view."""

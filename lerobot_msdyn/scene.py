@@ -40,10 +40,6 @@ class Gaussians:
         """Some of the Gaussians, by index or mask."""
         return Gaussians(**{item.name: getattr(self, item.name)[which] for item in fields(self)})
 
-    def to(self, device: torch.device | str) -> "Gaussians":
-        """The same set on a device."""
-        return Gaussians(**{item.name: getattr(self, item.name).to(device) for item in fields(self)})
-
 
 def concatenate(parts: list[Gaussians]) -> Gaussians:
     """One set of several."""
