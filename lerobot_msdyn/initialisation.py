@@ -20,7 +20,7 @@ from lerobot_msdyn.geometry import (
     se3,
     transform_points,
 )
-from lerobot_msdyn.motion.bases import MotionLevel, identity_level, level_affines
+from lerobot_msdyn.motion.bases import MotionLevel, carried, identity_level, level_affines
 from lerobot_msdyn.motion.initialise import ObjectMotion, object_motion
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.priors.depth import static_depth
@@ -81,14 +81,17 @@ def gather_moving(
     depth = priors.depth[(priors.instances > 0) & (priors.depth > 0)]
     voxel = config.moving_voxel_px * float(depth.median()) / float(view.camera.intrinsics[0, 0, 0])
     points, part = concatenate(gathered), torch.cat(parts)
+    extent = float((points.means.amax(0) - points.means.amin(0)).max())
     growth = 1.0
     merged = merge_voxels(points, part, voxel)
-    while len(merged[0]) > config.moving_gaussians:
+    while len(merged[0]) > config.moving_gaussians and growth * voxel <= extent:
         growth *= VOXEL_GROWTH
         merged = merge_voxels(points, part, growth * voxel)
     moving, part = merged
     kept = ~contradicted(moving.means, part, objects.level, view, priors, frames)
     moving, part = moving.select(kept), part[kept]
+    most = slice(config.moving_gaussians)  # one voxel per part may still be too many
+    moving, part = moving.select(most), part[most]
     return replace(moving, log_scales=moving.log_scales + math.log(growth)), part
 
 
@@ -108,8 +111,7 @@ def contradicted(
     wrong, inside = torch.zeros(len(points)), torch.zeros(len(points))
     height, width = priors.depth.shape[1:]
     for frame in frames:
-        affine = level_affines(level, torch.tensor([frame]))[part, 0]
-        world = (affine[:, :, :3] @ points[:, :, None])[..., 0] + affine[:, :, 3]
+        world = carried(level, part, points, frame)
         camera = view.camera.select([frame])
         xy, z = project(transform_points(camera.camera_from_world, world[None])[0], camera.intrinsics[0])
         column, row = xy.floor().long().unbind(-1)
@@ -135,7 +137,8 @@ def to_canonical(gaussians: Gaussians, part: Int[Tensor, " n"], level: MotionLev
 
 def merge_voxels(gaussians: Gaussians, part: Int[Tensor, " n"], voxel: float) -> tuple[Gaussians, Int[Tensor, " m"]]:
     """One Gaussian per occupied voxel (side in m) and part: mean position and colour, the first one's shape."""
-    cells = torch.cat(((gaussians.means / voxel).floor().long(), part[:, None]), dim=1)
+    corner = gaussians.means.amin(0)
+    cells = torch.cat((((gaussians.means - corner) / voxel).floor().long(), part[:, None]), dim=1)
     _, group, count = torch.unique(cells, dim=0, return_inverse=True, return_counts=True)
     first = torch.full((len(count),), len(group)).scatter_reduce(0, group, torch.arange(len(group)), "amin")
 

@@ -36,8 +36,8 @@ class Gaussians:
         """Colours 0..1 (degree 0)."""
         return (self.sh[:, 0] * SH_C0 + 0.5).clamp(min=0)
 
-    def select(self, which: Tensor) -> "Gaussians":
-        """Some of the Gaussians, by index or mask."""
+    def select(self, which: Tensor | slice) -> "Gaussians":
+        """Some of the Gaussians, by index, mask or slice."""
         return Gaussians(**{item.name: getattr(self, item.name)[which] for item in fields(self)})
 
 

@@ -56,6 +56,10 @@ def test_bounds_on_the_number_of_gaussians_hold(pushed: tuple[View, Priors], ini
     assert few.moving.log_scales.mean() > initial.moving.log_scales.mean()
 
 
+def test_a_bound_below_the_number_of_parts_ends_too(pushed: tuple[View, Priors]) -> None:
+    assert 0 < len(initialise(*pushed, SceneConfig(moving_gaussians=1), MotionConfig()).moving) <= 1
+
+
 @pytest.mark.parametrize("why", ["no tracks", "not wanted"])
 def test_a_scene_without_motion(pushed: tuple[View, Priors], why: str) -> None:
     view, priors = pushed

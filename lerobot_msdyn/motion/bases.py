@@ -54,3 +54,11 @@ def level_affines(level: MotionLevel, frames: Int[Tensor, " b"]) -> Float[Tensor
     affines = torch.cat((rotations, offsets[..., None]), dim=-1)
     still = torch.eye(3, 4, dtype=affines.dtype, device=affines.device)
     return torch.where(level.active[:, None, None, None], affines, still)
+
+
+def carried(
+    level: MotionLevel, basis: Int[Tensor, " n"], points: Float[Tensor, "n 3"], frame: int
+) -> Float[Tensor, "n 3"]:
+    """Canonical points (m), each where its own basis carries it at a frame."""
+    affine = level_affines(level, torch.tensor([frame]))[basis, 0]
+    return (affine[:, :, :3] @ points[:, :, None])[..., 0] + affine[:, :, 3]

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from lerobot_msdyn.cameras import CameraTrack
 from lerobot_msdyn.geometry import invert_se3, transform_points
-from lerobot_msdyn.motion.bases import MotionLevel, identity_level, level_affines, level_from_motions
+from lerobot_msdyn.motion.bases import MotionLevel, carried, identity_level, level_from_motions
 from lerobot_msdyn.motion.gaps import STILL, fill_gaps, find_carriers
 from lerobot_msdyn.motion.lift import lift_tracks
 from lerobot_msdyn.motion.parts import split_rigid_parts
@@ -38,8 +38,7 @@ class ObjectMotion:
         All tracks take part, where their part has carried them, whether or not they are seen at that frame. Points
         of an instance without tracks go by the nearest tracks of any.
         """
-        affine = level_affines(self.level, torch.tensor([frame]))[self.part, 0]
-        moved = (affine[:, :, :3] @ self.points[:, :, None])[..., 0] + affine[:, :, 3]
+        moved = carried(self.level, self.part, self.points, frame)
         out = torch.zeros(len(points), dtype=torch.long)
         for label in instance.unique():
             rows = (instance == label).nonzero()[:, 0]
