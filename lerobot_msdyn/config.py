@@ -12,6 +12,7 @@ import draccus
 
 # Named: draccus finds the comment above a field only where its annotation holds no quotes.
 Device = Literal["auto", "cpu", "cuda"]
+LevelName = Literal["object", "primitive", "grain", "particle", "flat", "field"]
 
 
 @dataclass
@@ -48,14 +49,43 @@ class SceneConfig:
     moving_frames: int = 20
     # Side of the voxels in which the gathered moving points are merged, in pixels of the fitted image.
     moving_voxel_px: float = 0.8
+    # Balls instead of ellipsoids.
+    isotropic: bool = False
+
+
+@dataclass
+class FramesPerKnot:
+    """Frames from one knot of a motion to the next; between them it is interpolated."""
+
+    # Objects.
+    object: int = 1
+    # Primitives.
+    primitive: int = 2
+    # Grains.
+    grain: int = 4
+    # Particles.
+    particle: int = 4
 
 
 @dataclass
 class MotionConfig:
     """The levels of motion."""
 
+    # Coarse to fine: object, then any of primitive, grain, particle; or flat or field alone: other systems' models.
+    levels: list[LevelName] = field(default_factory=lambda: ["object", "primitive", "grain"])
     # Rigid parts per moving instance at the object level (a robot arm is one instance with several parts).
     max_parts: int = 6
+    # Primitives per rigid part.
+    primitives: int = 5
+    # Grains per primitive.
+    grains: int = 10
+    # Particles in the whole scene.
+    particles: int = 512
+    # Bases of the flat model in the whole scene.
+    flat_bases: int = 10
+    # Keep a finer level, part by part, only where it predicts tracks better that it was not fitted to.
+    gate: bool = True
+    frames_per_knot: FramesPerKnot = field(default_factory=FramesPerKnot)
 
 
 @dataclass
@@ -186,11 +216,26 @@ def problems(config: object, prefix: str = "") -> list[str]:
         value = getattr(config, name)
         if not low <= value <= high:
             lines.append(f"{prefix}{name} is {value}; expected a value from {low} to {high}")
+    if isinstance(config, MotionConfig) and not _is_hierarchy(config.levels):
+        lines.append(
+            f"{prefix}levels is [{', '.join(config.levels)}]; expected [object], then any of primitive, grain (after "
+            "primitive) and particle in this order; or [flat] or [field] alone"
+        )
     for item in fields(config):  # type: ignore[arg-type]
         value = getattr(config, item.name)
         if is_dataclass(value):
             lines += problems(value, f"{prefix}{item.name}.")
     return lines
+
+
+def _is_hierarchy(levels: list[LevelName]) -> bool:
+    """Whether levels go from coarse to fine, each with what carries it."""
+    order = ("object", "primitive", "grain", "particle")
+    if levels in (["flat"], ["field"]):
+        return True
+    fine = list(levels[1:])
+    ascending = fine == [name for name in order[1:] if name in fine]
+    return levels[:1] == ["object"] and ascending and ("grain" not in fine or "primitive" in fine)
 
 
 _ANY = float("inf")
@@ -207,7 +252,14 @@ _RANGES: dict[str, tuple[tuple[str, float, float], ...]] = {
         ("moving_frames", 1, 100_000),
         ("moving_voxel_px", 0.05, 100),
     ),
-    "MotionConfig": (("max_parts", 1, 64),),
+    "MotionConfig": (
+        ("max_parts", 1, 64),
+        ("primitives", 1, 1000),
+        ("grains", 1, 1000),
+        ("particles", 1, 100_000),
+        ("flat_bases", 1, 10_000),
+    ),
+    "FramesPerKnot": tuple((name, 1, 1000) for name in ("object", "primitive", "grain", "particle")),
     "LossWeights": (("rgb", 0, _ANY), ("depth", 0, _ANY), ("mask", 0, _ANY)),
     "LearningRates": tuple((name, 0, 1) for name in ("means", "log_scales", "quats", "opacity_logits", "colours")),
     "FitConfig": (("steps", 0, 1_000_000), ("max_width", 16, 8192)),

@@ -1,7 +1,7 @@
 """Gaussians, and a scene of a static and a moving set; saved as safetensors with a schema version."""
 
 import json
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import torch
@@ -12,9 +12,11 @@ from torch import Tensor
 
 from lerobot_msdyn.errors import MsdynError
 from lerobot_msdyn.motion.bases import MotionLevel
-from lerobot_msdyn.motion.compose import compose
+from lerobot_msdyn.motion.compose import Level, compose
+from lerobot_msdyn.motion.field import DeformationField
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+LEVEL_KINDS: dict[str, type] = {"bases": MotionLevel, "field": DeformationField}
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic
 
 
@@ -24,7 +26,7 @@ class Gaussians:
 
     means: Float[Tensor, "g 3"]  # m
     quats: Float[Tensor, "g 4"]  # wxyz, of any non-zero length
-    log_scales: Float[Tensor, "g 3"]  # log of standard deviations in m
+    log_scales: Float[Tensor, "g s"]  # log of standard deviations in m; s = 3, or 1 for isotropic Gaussians
     opacity_logits: Float[Tensor, " g"]
     sh: Float[Tensor, "g k 3"]
 
@@ -35,6 +37,11 @@ class Gaussians:
     def rgb(self) -> Float[Tensor, "g 3"]:
         """Colours 0..1 (degree 0)."""
         return (self.sh[:, 0] * SH_C0 + 0.5).clamp(min=0)
+
+    @property
+    def scales(self) -> Float[Tensor, "g 3"]:
+        """Standard deviations along the three axes, m."""
+        return self.log_scales.exp().expand(-1, 3)
 
     def select(self, which: Tensor | slice) -> "Gaussians":
         """Some of the Gaussians, by index, mask or slice."""
@@ -82,9 +89,9 @@ class DynamicScene:
 
     static: Gaussians
     moving: Gaussians
-    levels: tuple[MotionLevel, ...]  # coarse to fine
-    indices: tuple[Int[Tensor, "n k"], ...]  # per level: the bases that move each Gaussian
-    logits: tuple[Float[Tensor, "n k"], ...]  # per level: their weights before the softmax
+    levels: tuple[Level, ...]  # coarse to fine
+    indices: tuple[Int[Tensor, "n _"], ...]  # per level: the bases that move each Gaussian
+    logits: tuple[Float[Tensor, "n _"], ...]  # per level: their weights before the softmax
     frames: int
 
     def at(self, frames: Int[Tensor, " b"]) -> Snapshot:
@@ -95,11 +102,17 @@ class DynamicScene:
         return Snapshot(
             means=torch.cat((static.means.expand(b, -1, -1), means), dim=1),
             quats=torch.cat((static.quats.expand(b, -1, -1), quats), dim=1),
-            scales=torch.cat((static.log_scales, moving.log_scales)).exp(),
+            scales=torch.cat((static.scales, moving.scales)),
             opacities=torch.cat((static.opacity_logits, moving.opacity_logits)).sigmoid(),
             rgb=torch.cat((static.rgb, moving.rgb)),
             moving=torch.cat((torch.zeros_like(static.opacity_logits), torch.ones_like(moving.opacity_logits))),
         )
+
+
+def isotropic(gaussians: Gaussians) -> Gaussians:
+    """The same Gaussians as balls of the same cross-section: the geometric mean of the two larger axes."""
+    two_larger = gaussians.log_scales.sort(dim=-1, descending=True).values[:, :2]
+    return replace(gaussians, log_scales=two_larger.mean(-1, keepdim=True))
 
 
 def save_scene(scene: DynamicScene, path: Path) -> None:
@@ -110,7 +123,12 @@ def save_scene(scene: DynamicScene, path: Path) -> None:
     for i, level in enumerate(scene.levels):
         tensors |= {f"levels.{i}.{item.name}": getattr(level, item.name) for item in fields(level)}
         tensors |= {f"levels.{i}.indices": scene.indices[i], f"levels.{i}.logits": scene.logits[i]}
-    header = {"schema": SCHEMA_VERSION, "levels": len(scene.levels), "frames": scene.frames}
+    names = {kind: name for name, kind in LEVEL_KINDS.items()}
+    header = {
+        "schema": SCHEMA_VERSION,
+        "levels": [names[type(level)] for level in scene.levels],
+        "frames": scene.frames,
+    }
     partial = path.with_name(path.name + ".partial")
     save_file(
         {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()},
@@ -134,16 +152,19 @@ def load_scene(path: Path) -> DynamicScene:
         raise MsdynError(f"{path}: not a readable scene file ({error})") from error
     if header.get("schema") != SCHEMA_VERSION:
         raise MsdynError(f"{path}: scene schema is {header.get('schema')}; expected {SCHEMA_VERSION}; fit it again")
-    levels = range(header["levels"])
+    kinds = header.get("levels", [])
 
     def part(name: str, kind: type) -> dict[str, Tensor]:
         return {item.name: tensors[f"{name}.{item.name}"] for item in fields(kind)}
 
-    return DynamicScene(
-        static=Gaussians(**part("static", Gaussians)),
-        moving=Gaussians(**part("moving", Gaussians)),
-        levels=tuple(MotionLevel(**part(f"levels.{i}", MotionLevel)) for i in levels),
-        indices=tuple(tensors[f"levels.{i}.indices"] for i in levels),
-        logits=tuple(tensors[f"levels.{i}.logits"] for i in levels),
-        frames=header["frames"],
-    )
+    try:
+        return DynamicScene(
+            static=Gaussians(**part("static", Gaussians)),
+            moving=Gaussians(**part("moving", Gaussians)),
+            levels=tuple(LEVEL_KINDS[kind](**part(f"levels.{i}", LEVEL_KINDS[kind])) for i, kind in enumerate(kinds)),
+            indices=tuple(tensors[f"levels.{i}.indices"] for i in range(len(kinds))),
+            logits=tuple(tensors[f"levels.{i}.logits"] for i in range(len(kinds))),
+            frames=header["frames"],
+        )
+    except KeyError as error:
+        raise MsdynError(f"{path}: not a readable scene file ({error} is missing)") from error

@@ -1,5 +1,6 @@
 """Scenes: what they hold at a time, saved and loaded."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -8,8 +9,17 @@ from safetensors.torch import save_file
 
 from lerobot_msdyn.errors import MsdynError
 from lerobot_msdyn.geometry import axis_angle_to_matrix, se3
-from lerobot_msdyn.motion.bases import level_from_motions
-from lerobot_msdyn.scene import DynamicScene, Gaussians, concatenate, gaussians_from_points, load_scene, save_scene
+from lerobot_msdyn.motion.bases import MotionLevel, level_from_motions
+from lerobot_msdyn.motion.field import DeformationField, fit_field
+from lerobot_msdyn.scene import (
+    DynamicScene,
+    Gaussians,
+    concatenate,
+    gaussians_from_points,
+    isotropic,
+    load_scene,
+    save_scene,
+)
 
 
 def some_gaussians(count: int, seed: int = 0) -> Gaussians:
@@ -79,6 +89,33 @@ def test_a_saved_scene_comes_back(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["scene.safetensors"]
 
 
+def test_all_kinds_of_levels_come_back(tmp_path: Path) -> None:
+    scene = scene_with_two_parts()
+    points = torch.randn(20, 3, generator=torch.Generator().manual_seed(0))
+    field = fit_field(points, points[:, None].expand(-1, 3, -1), torch.ones(20, 3), steps=2)
+    nothing = torch.zeros(3, 0)
+    scene = replace(
+        scene,
+        levels=(*scene.levels, field),
+        indices=(*scene.indices, nothing.long()),
+        logits=(*scene.logits, nothing),
+        moving=isotropic(scene.moving),
+    )
+    save_scene(scene, tmp_path / "scene.safetensors")
+    again = load_scene(tmp_path / "scene.safetensors")
+    assert [type(level) for level in again.levels] == [MotionLevel, DeformationField]
+    assert torch.equal(again.at(torch.tensor([1, 2])).means, scene.at(torch.tensor([1, 2])).means)
+    assert torch.equal(again.at(torch.tensor([1])).scales, scene.at(torch.tensor([1])).scales)
+
+
+def test_a_scene_without_some_of_its_arrays_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "scene.safetensors"
+    header = '{"schema": 2, "levels": ["bases"], "frames": 3}'
+    save_file({"static.means": torch.zeros(1, 3)}, path, metadata={"lerobot_msdyn": header})
+    with pytest.raises(MsdynError, match=r"not a readable scene file .*is missing"):
+        load_scene(path)
+
+
 def test_what_is_no_scene_is_named(tmp_path: Path) -> None:
     path = tmp_path / "scene.safetensors"
     with pytest.raises(MsdynError, match="not a readable scene file"):
@@ -87,5 +124,5 @@ def test_what_is_no_scene_is_named(tmp_path: Path) -> None:
     with pytest.raises(MsdynError, match="not a readable scene file"):
         load_scene(path)
     save_file({"a": torch.zeros(1)}, path, metadata={"lerobot_msdyn": '{"schema": 99}'})
-    with pytest.raises(MsdynError, match="scene schema is 99; expected 1"):
+    with pytest.raises(MsdynError, match="scene schema is 99; expected 2"):
         load_scene(path)
