@@ -20,8 +20,9 @@ def coherence(
 ) -> Float[Tensor, "n t"]:
     """1 for positions that move as the tracks about them do, towards 0 for those that do not (Geman-McClure).
 
-    The displacement of a track is compared with the median displacement of its nearest neighbours at the same time.
-    The usual deviation is that of its part: noise, and as much bending as is usual between neighbours.
+    The displacement of a track is compared with the median displacement of its nearest neighbours at the same time,
+    in units of their own spread (where things bend, neighbours differ) or of the usual deviation in the part (noise),
+    whichever is larger.
 
     Args:
         points: canonical points, m.
@@ -36,12 +37,14 @@ def coherence(
         rows = (part == label).nonzero()[:, 0]
         if len(rows) <= _NEIGHBOURS:
             continue
+        deviation, spread = torch.zeros(2, len(rows), valid.shape[1])
         near = torch.cdist(points[rows], points[rows]).topk(_NEIGHBOURS + 1, largest=False).indices[:, 1:]
-        deviation = torch.cat(
-            [(moved[rows[some]] - moved[rows[near[some]]].median(dim=1).values).norm(dim=-1)
-             for some in torch.arange(len(rows)).split(_CHUNK)]
-        )  # fmt: skip
+        for some in torch.arange(len(rows)).split(_CHUNK):
+            around = moved[rows[near[some]]]
+            middle = around.median(dim=1).values
+            spread[some] = (around - middle[:, None]).norm(dim=-1).median(dim=1).values
+            deviation[some] = (moved[rows[some]] - middle).norm(dim=-1)
         usual = deviation[valid[rows]].median() if bool(valid[rows].any()) else deviation.new_zeros(())
-        scale = _TOLERANCE * usual.clamp(min=max(noise, 1e-9))
+        scale = _TOLERANCE * torch.maximum(spread, usual.clamp(min=max(noise, 1e-9)))
         trust[rows] = 1 / (1 + (deviation / scale).square()).square()
     return trust

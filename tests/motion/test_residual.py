@@ -51,7 +51,7 @@ def test_collinear_and_tiny_sets_only_shift() -> None:
         motion = solved(points, moved(points))[2]
         torch.testing.assert_close(motion[:3, :3], torch.eye(3).double())
         centre = points.mean(0).double()
-        torch.testing.assert_close(motion[:3, :3] @ centre + motion[:3, 3], centre + SHIFT.double(), atol=2e-3, rtol=0)
+        torch.testing.assert_close(motion[:3, :3] @ centre + motion[:3, 3], centre + SHIFT.double(), atol=5e-3, rtol=0)
 
 
 def test_a_mirrored_set_is_not_reflected() -> None:
