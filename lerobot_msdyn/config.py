@@ -83,17 +83,27 @@ class LearningRates:
     # Opacity logits.
     opacity_logits: float = 2e-2
     # Colour coefficients.
-    colours: float = 5e-3
+    colours: float = 1e-2
 
 
 @dataclass
 class FitConfig:
     """The optimisation."""
 
-    # Number of Adam steps; each draws one frame.
-    steps: int = 300
+    # Largest number of Adam steps; each draws one frame.
+    steps: int = 500
     # Widest image that is fitted, in pixels; wider videos are fitted at a reduced size and rendered at their own.
     max_width: int = 320
+    # Whether the static set's brightness follows the video (moving shadows, exposure).
+    shadows: bool = True
+    # Degree of the moving set's spherical harmonics, 0 or 1: how its colours change as it turns.
+    sh_degree: int = 1
+    # Share of the steps after which the moving set's brightness over time is measured; 1: never.
+    moving_gain_from: float = 0.6
+    # Frames that are not fitted but tell when to stop; 0: all steps are taken.
+    held_out_frames: int = 3
+    # Steps without improvement on the held-out frames after which the fit stops.
+    patience: int = 150
     weights: LossWeights = field(default_factory=LossWeights)
     learning_rates: LearningRates = field(default_factory=LearningRates)
 
@@ -210,7 +220,14 @@ _RANGES: dict[str, tuple[tuple[str, float, float], ...]] = {
     "MotionConfig": (("max_parts", 1, 64),),
     "LossWeights": (("rgb", 0, _ANY), ("depth", 0, _ANY), ("mask", 0, _ANY)),
     "LearningRates": tuple((name, 0, 1) for name in ("means", "log_scales", "quats", "opacity_logits", "colours")),
-    "FitConfig": (("steps", 0, 1_000_000), ("max_width", 16, 8192)),
+    "FitConfig": (
+        ("steps", 0, 1_000_000),
+        ("max_width", 16, 8192),
+        ("sh_degree", 0, 1),
+        ("moving_gain_from", 0, 1),
+        ("held_out_frames", 0, 1000),
+        ("patience", 1, 1_000_000),
+    ),
     "OrbitConfig": (("azimuth_deg", 0, 90), ("elevation_deg", 0, 60), ("translation_rel", 0, 1)),
     "JitterConfig": (("translation_rel", 0, 1), ("rotation_deg", 0, 45)),
 }
