@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lerobot_msdyn.background import background_gaussians, fill_depth, pixel_gaussians
+from lerobot_msdyn.background import EmptyScene, background_gaussians, empty_scene, fill_depth, pixel_gaussians
 from lerobot_msdyn.config import MotionConfig, SceneConfig
 from lerobot_msdyn.episode import View
 from lerobot_msdyn.geometry import (
@@ -23,7 +23,6 @@ from lerobot_msdyn.geometry import (
 from lerobot_msdyn.motion.bases import MotionLevel, carried, identity_level, level_affines
 from lerobot_msdyn.motion.initialise import ObjectMotion, object_motion
 from lerobot_msdyn.priors import Priors
-from lerobot_msdyn.priors.depth import static_depth
 from lerobot_msdyn.scene import DynamicScene, Gaussians, concatenate
 
 MASK_BORDER_PX = 1  # pixels along the border of a mask mix two surfaces
@@ -33,7 +32,9 @@ VOXEL_GROWTH = 1.15  # of the voxels' side, until there are few enough
 EDGE_JUMP = 0.03  # relative difference of neighbouring depths beyond which a pixel may lie between two surfaces
 
 
-def initialise(view: View, priors: Priors, scene: SceneConfig, motion: MotionConfig) -> DynamicScene:
+def initialise(
+    view: View, priors: Priors, scene: SceneConfig, motion: MotionConfig, empty: EmptyScene | None = None
+) -> DynamicScene:
     """A scene ready to be fitted.
 
     Args:
@@ -41,9 +42,11 @@ def initialise(view: View, priors: Priors, scene: SceneConfig, motion: MotionCon
         priors: its priors, at the same size.
         scene: numbers of Gaussians.
         motion: the levels of motion.
+        empty: what stands still; default: as this video shows it.
     """
-    background = static_depth(priors.depth, priors.instances)
-    static = background_gaussians(priors.empty, background, view.camera, scene.static_gaussians)
+    if empty is None:
+        empty = empty_scene(view.rgb, priors.depth, priors.instances)
+    static = background_gaussians(empty.rgb, empty.depth, view.camera, scene.static_gaussians)
     frames = len(view.rgb)
     objects = None
     if scene.moving_gaussians > 0:

@@ -3,7 +3,7 @@
 import contextlib
 import logging
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -12,6 +12,7 @@ from jaxtyping import Float, Float32, UInt8
 from lerobot.datasets import LeRobotDatasetMetadata
 from torch import Tensor
 
+from lerobot_msdyn.background import empty_scene
 from lerobot_msdyn.cameras import CameraTrack
 from lerobot_msdyn.config import Recipe
 from lerobot_msdyn.episode import View, depth_key_of, read_episode
@@ -19,7 +20,6 @@ from lerobot_msdyn.fitting import FitResult, fit
 from lerobot_msdyn.initialisation import initialise
 from lerobot_msdyn.perturbation import draw_offset, draw_rng, look_at_distance, perturb
 from lerobot_msdyn.priors import Priors, estimate_priors
-from lerobot_msdyn.priors.depth import static_depth
 from lerobot_msdyn.provenance import SOURCE_VARIANT, Provenance
 from lerobot_msdyn.quality import HOLE_ALPHA, fill_holes
 from lerobot_msdyn.rendering import render_frames, resized
@@ -90,8 +90,10 @@ def reconstruct(view: View, recipe: Recipe, progress: Callable[[float], object] 
     view = shrink(view, recipe.fit.max_width)
     with _one_torch_thread():
         priors = estimate_priors(view, recipe.priors, recipe.camera)
-        distance = look_at_distance(static_depth(priors.depth, priors.instances))
-        scene = initialise(view, priors, recipe.scene, recipe.motion)
+        empty = empty_scene(view.rgb, priors.depth, priors.instances)
+        priors = replace(priors, empty=empty.rgb)
+        distance = look_at_distance(empty.depth)
+        scene = initialise(view, priors, recipe.scene, recipe.motion, empty)
     result = fit(
         scene,
         view,

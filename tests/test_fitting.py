@@ -118,9 +118,10 @@ def test_the_fit_stops_when_held_out_frames_no_longer_improve() -> None:
         priors, depth=priors.depth[:1].expand(12, -1, -1), instances=priors.instances[:1].expand(12, -1, -1)
     )
     config = FitConfig(steps=400, held_out_frames=1, patience=50)
+    scene = dataclasses.replace(grey_scene(view), frames=12, levels=(identity_level(torch.zeros(1, 3), 12),))
     config.learning_rates = LearningRates(0.0, 0.0, 0.0, 0.0, 0.0)  # nothing ever improves
     seen: list[int] = []
-    result = fit(grey_scene(many), many, known, config, distance=1.0, seed=0, progress=seen.append)
+    result = fit(scene, many, known, config, distance=1.0, seed=0, progress=seen.append)
     assert result.steps == 100
     assert sum(seen) == 400
 
