@@ -40,6 +40,8 @@ class PriorsConfig:
 class SceneConfig:
     """How many Gaussians, and from where."""
 
+    # Whether what one episode never shows of a fixed camera's background is taken from the others.
+    shared_background: bool = True
     # Upper bound for the static set; one Gaussian per pixel of the fitted image where it suffices.
     static_gaussians: int = 80_000
     # Upper bound for the moving set.

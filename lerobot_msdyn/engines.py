@@ -9,7 +9,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 from lerobot_msdyn.config import AugmentConfig
 from lerobot_msdyn.episode import depth_key_of
 from lerobot_msdyn.errors import ConfigError, EpisodeError, MsdynError
-from lerobot_msdyn.pipeline import augment_episode
+from lerobot_msdyn.pipeline import augment_episode, shared_backgrounds
 from lerobot_msdyn.write import NewEpisode, OutputDataset
 
 logger = logging.getLogger(__name__)
@@ -34,11 +34,13 @@ def run_local(
         def progress(what: str, share: float) -> None:
             if what:
                 bar.set_description_str(what)
-            bar.update(share)
+            bar.update(min(share, len(episodes) - bar.n))  # shares add up to one only up to rounding
 
+        bar.set_description_str("looking at the background")
+        backgrounds = shared_backgrounds(source, cameras, config)
         for done, index in enumerate(episodes, start=1):
             try:
-                new += augment_episode(source, index, cameras, config, output, progress)
+                new += augment_episode(source, index, cameras, config, output, progress, backgrounds)
             except EpisodeError as error:
                 logger.error("skipped: %s", error)
                 failures.append(error)

@@ -2,7 +2,7 @@
 
 import contextlib
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -16,17 +16,29 @@ from lerobot_msdyn.background import empty_scene
 from lerobot_msdyn.cameras import CameraTrack
 from lerobot_msdyn.config import Recipe
 from lerobot_msdyn.episode import View, depth_key_of, read_episode
+from lerobot_msdyn.errors import EpisodeError
 from lerobot_msdyn.fitting import FitResult, fit
 from lerobot_msdyn.initialisation import initialise
 from lerobot_msdyn.perturbation import draw_offset, draw_rng, look_at_distance, perturb
-from lerobot_msdyn.priors import Priors, estimate_priors
+from lerobot_msdyn.priors import PointTracks, Priors, estimate_priors
 from lerobot_msdyn.provenance import SOURCE_VARIANT, Provenance
 from lerobot_msdyn.quality import HOLE_ALPHA, fill_holes
 from lerobot_msdyn.rendering import render_frames, resized
+from lerobot_msdyn.shared import (
+    MAX_EPISODES,
+    SharedBackground,
+    adapted,
+    completed,
+    few_frames,
+    share_backgrounds,
+)
 from lerobot_msdyn.write import NewEpisode, OutputDataset
 
 logger = logging.getLogger(__name__)
 
+FURTHER_STEPS = 0.6  # share of the fit's steps that suffices where the static set has been fitted already
+
+Backgrounds = Mapping[str, Sequence[SharedBackground]]  # by camera
 Progress = Callable[[str, float], object]  # (what is being done, share of the episode done since the last call)
 
 
@@ -48,6 +60,44 @@ class Picture:
     depth: Float32[np.ndarray, "h w"]  # m, z-depth; 0 where nothing is known, and everywhere if there is no true scale
 
 
+def shared_backgrounds(source: LeRobotDatasetMetadata, cameras: list[str], recipe: Recipe) -> Backgrounds:
+    """Per camera, what some of its episodes show together, fitted once; one for every place in which it stood.
+
+    Episodes that cannot be read are left out here, and reported when it is their turn.
+    """
+    if not recipe.scene.shared_background or source.total_episodes < 2:
+        return {}
+    views: dict[str, list[View]] = {key: [] for key in cameras}
+    count = min(MAX_EPISODES, source.total_episodes)
+    for index in sorted({round(i * (source.total_episodes - 1) / (count - 1)) for i in range(count)}):
+        with contextlib.suppress(EpisodeError):
+            episode = read_episode(source, index, cameras, recipe.camera, recorded_depth=recipe.priors.depth != "plane")
+            for key, view in episode.views.items():
+                views[key].append(shrink(few_frames(view), recipe.fit.max_width))
+    with _one_torch_thread():
+        found = {key: share_backgrounds(some) for key, some in views.items()}
+    return {key: [_fitted(background, recipe) for background in some] for key, some in found.items()}
+
+
+def _fitted(background: SharedBackground, recipe: Recipe) -> SharedBackground:
+    """A shared background with a static set that was fitted to its picture; without depth there is none."""
+    empty, camera = background.empty, background.camera
+    if not bool((empty.depth > 0).any()):
+        return background
+    nothing = torch.zeros(1, *empty.seen.shape, dtype=torch.uint8)
+    priors = Priors(empty.depth[None], nothing, empty.rgb, _no_tracks(), metric=True)
+    view = View(empty.rgb[None], camera)
+    scene = initialise(view, priors, replace(recipe.scene, moving_gaussians=0), recipe.motion, empty)
+    config = replace(recipe.fit, steps=recipe.fit.steps // 2, shadows=False, held_out_frames=0)
+    result = fit(scene, view, priors, config, distance=look_at_distance(empty.depth), seed=recipe.seed)
+    return replace(background, static=result.scene.static)
+
+
+def _no_tracks() -> PointTracks:
+    none = torch.zeros(0, 1)
+    return PointTracks(torch.zeros(0, 1, 2), none.bool(), none, torch.zeros(0, dtype=torch.long))
+
+
 def augment_episode(
     source: LeRobotDatasetMetadata,
     index: int,
@@ -55,8 +105,9 @@ def augment_episode(
     recipe: Recipe,
     output: OutputDataset,
     progress: Progress = lambda what, share: None,
+    backgrounds: Backgrounds | None = None,
 ) -> list[NewEpisode]:
-    """All new episodes of one source episode, staged in the output.
+    """All new episodes of one source episode, staged in the output; `backgrounds` come from `shared_backgrounds`.
 
     Raises:
         EpisodeError: the episode cannot be read.
@@ -66,7 +117,8 @@ def augment_episode(
     scenes = {}
     for key, view in episode.views.items():
         progress(f"episode {index}: fitting {key}", 0.0)
-        scenes[key] = reconstruct(view, recipe, lambda share: progress("", 0.5 * share / len(cameras)))
+        shared = (backgrounds or {}).get(key, [])
+        scenes[key] = reconstruct(view, recipe, lambda share: progress("", 0.5 * share / len(cameras)), shared)
     priors = {key: scene.priors.provenance for key, scene in scenes.items()}
     new = []
     if recipe.include_source:
@@ -84,24 +136,36 @@ def augment_episode(
     return new
 
 
-def reconstruct(view: View, recipe: Recipe, progress: Callable[[float], object] = lambda share: None) -> Reconstruction:
-    """Priors, initial scene and fit of one camera's video."""
+def reconstruct(
+    view: View,
+    recipe: Recipe,
+    progress: Callable[[float], object] = lambda share: None,
+    backgrounds: Sequence[SharedBackground] = (),
+) -> Reconstruction:
+    """Priors, initial scene and fit of one camera's video; the first of the shared backgrounds that fits is used."""
     camera = view.camera
     view = shrink(view, recipe.fit.max_width)
     with _one_torch_thread():
         priors = estimate_priors(view, recipe.priors, recipe.camera)
         empty = empty_scene(view.rgb, priors.depth, priors.instances)
+        shared = next((background for background in backgrounds if background.fits(view)), None)
+        if shared is not None:
+            empty = completed(empty, shared.empty)
         priors = replace(priors, empty=empty.rgb)
         distance = look_at_distance(empty.depth)
         scene = initialise(view, priors, recipe.scene, recipe.motion, empty)
+        steps = recipe.fit.steps
+        if shared is not None and shared.static is not None:
+            scene = replace(scene, static=adapted(shared, empty, scene.static))
+            steps = round(FURTHER_STEPS * steps)
     result = fit(
         scene,
         view,
         priors,
-        recipe.fit,
+        replace(recipe.fit, steps=steps),
         distance=distance,
         seed=recipe.seed,
-        progress=lambda steps: progress(steps / recipe.fit.steps),
+        progress=lambda done: progress(done / steps),
     )
     return Reconstruction(result, priors, camera, distance)
 

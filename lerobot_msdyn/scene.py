@@ -75,8 +75,13 @@ def gaussians_from_points(
         quats=quats.contiguous(),
         log_scales=scales.clamp(min=1e-6).log(),
         opacity_logits=logit.expand(len(means)).clone(),
-        sh=((rgb - 0.5) / SH_C0)[:, None].contiguous(),
+        sh=rgb_to_sh(rgb),
     )
+
+
+def rgb_to_sh(rgb: Float[Tensor, "g 3"]) -> Float[Tensor, "g 1 3"]:
+    """Colours 0..1 as spherical harmonics of degree 0."""
+    return ((rgb - 0.5) / SH_C0)[:, None].contiguous()
 
 
 @dataclass(frozen=True)
