@@ -96,6 +96,8 @@ class FitConfig:
     steps: int = 500
     # Widest image that is fitted, in pixels; wider videos are fitted at a reduced size and rendered at their own.
     max_width: int = 320
+    # Longest part of a video that is fitted as one scene, in frames; longer videos are cut into equal parts.
+    window_frames: int = 300
     # Whether the static set's brightness follows the video (moving shadows, exposure).
     shadows: bool = True
     # Degree of the moving set's spherical harmonics, 0 or 1: how its colours change as it turns.
@@ -225,6 +227,7 @@ _RANGES: dict[str, tuple[tuple[str, float, float], ...]] = {
     "FitConfig": (
         ("steps", 0, 1_000_000),
         ("max_width", 16, 8192),
+        ("window_frames", 1, 100_000),
         ("sh_degree", 0, 1),
         ("moving_gain_from", 0, 1),
         ("held_out_frames", 0, 1000),

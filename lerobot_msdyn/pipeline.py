@@ -1,6 +1,7 @@
 """The whole flow on one screen: an episode in, a scene per camera, new episodes out."""
 
 import contextlib
+import itertools
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -44,12 +45,19 @@ Progress = Callable[[str, float], object]  # (what is being done, share of the e
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """One camera's scene and what was known about its video."""
+    """One camera's scenes, one per window of its video, and what was known about it."""
 
-    result: FitResult
-    priors: Priors
+    results: tuple[FitResult, ...]
+    starts: tuple[int, ...]  # first frame of each window
+    metric: bool  # whether depth is in true metres
+    provenance: dict[str, str]  # prior -> provider and why, of the first window
     camera: CameraTrack  # at the size of the recorded video
     distance: float  # m, to the look-at point
+
+    @property
+    def seconds(self) -> float:
+        """Time that was spent in fitting."""
+        return sum(result.seconds for result in self.results)
 
 
 @dataclass(frozen=True)
@@ -119,7 +127,7 @@ def augment_episode(
         progress(f"episode {index}: fitting {key}", 0.0)
         shared = (backgrounds or {}).get(key, [])
         scenes[key] = reconstruct(view, recipe, lambda share: progress("", 0.5 * share / len(cameras)), shared)
-    priors = {key: scene.priors.provenance for key, scene in scenes.items()}
+    priors = {key: scene.provenance for key, scene in scenes.items()}
     new = []
     if recipe.include_source:
         new.append(NewEpisode(index, Provenance(source.repo_id, index, SOURCE_VARIANT, recipe.seed, {}, priors)))
@@ -142,9 +150,44 @@ def reconstruct(
     progress: Callable[[float], object] = lambda share: None,
     backgrounds: Sequence[SharedBackground] = (),
 ) -> Reconstruction:
-    """Priors, initial scene and fit of one camera's video; the first of the shared backgrounds that fits is used."""
-    camera = view.camera
-    view = shrink(view, recipe.fit.max_width)
+    """Priors, initial scene and fit of one camera's video; the first of the shared backgrounds that fits is used.
+
+    Long videos are cut into windows, each with priors and a scene of its own, so that memory beyond the video itself
+    is that of one window. Windows share a background as episodes do.
+    """
+    windows = _windows(view, recipe)
+    if len(windows) > 1 and not backgrounds and recipe.scene.shared_background:
+        some = [shrink(few_frames(window), recipe.fit.max_width) for _, window in windows]
+        backgrounds = [_fitted(background, recipe) for background in share_backgrounds(some)]
+    fitted = []
+    for number, (_, window) in enumerate(windows):
+
+        def within(share: float, done: int = number) -> object:
+            return progress((done + share) / len(windows))
+
+        fitted.append(_fit_window(shrink(window, recipe.fit.max_width), recipe, within, backgrounds))
+    results, known, distances = zip(*fitted, strict=True)
+    starts = tuple(start for start, _ in windows)
+    return Reconstruction(results, starts, known[0].metric, known[0].provenance, view.camera, distances[0])
+
+
+def _windows(view: View, recipe: Recipe) -> list[tuple[int, View]]:
+    """First frames and parts of a video, of about equal length; depth from a file is for the whole video."""
+    frames = len(view.rgb)
+    count = 1 if recipe.priors.depth not in ("auto", "recorded", "plane") else -(-frames // recipe.fit.window_frames)
+    bounds = [round(i * frames / count) for i in range(count + 1)]
+    parts = []
+    for start, end in itertools.pairwise(bounds):
+        depth = None if view.depth is None else view.depth[start:end]
+        parts.append((start, View(view.rgb[start:end], view.camera.select(slice(start, end)), depth, view.depth_range)))
+    return parts
+
+
+def _fit_window(
+    view: View, recipe: Recipe, progress: Callable[[float], object], backgrounds: Sequence[SharedBackground]
+) -> tuple[FitResult, Priors, float]:
+    """A fitted scene of one window at the size at which it is fitted, its priors, and its look-at distance (m)."""
+    steps = recipe.fit.steps
     with _one_torch_thread():
         priors = estimate_priors(view, recipe.priors, recipe.camera)
         empty = empty_scene(view.rgb, priors.depth, priors.instances)
@@ -154,7 +197,6 @@ def reconstruct(
         priors = replace(priors, empty=empty.rgb)
         distance = look_at_distance(empty.depth)
         scene = initialise(view, priors, recipe.scene, recipe.motion, empty)
-        steps = recipe.fit.steps
         if shared is not None and shared.static is not None:
             scene = replace(scene, static=adapted(shared, empty, scene.static))
             steps = round(FURTHER_STEPS * steps)
@@ -167,7 +209,7 @@ def reconstruct(
         seed=recipe.seed,
         progress=lambda done: progress(done / steps),
     )
-    return Reconstruction(result, priors, camera, distance)
+    return result, priors, distance
 
 
 @contextlib.contextmanager
@@ -196,15 +238,24 @@ def by_feature(
 
 
 def new_pictures(scene: Reconstruction, camera: CameraTrack, frames: Tensor | None = None) -> Iterator[Picture]:
-    """The scene's frames through another camera, holes filled; the share of holes is logged at the end."""
-    holes = []
-    for rendering in render_frames(scene.result.scene, camera, frames):
-        drawn = (rendering.rgb.clamp(0, 1) * 255).round().to(torch.uint8)
-        for rgb, alpha, depth in zip(drawn.numpy(), rendering.alpha.numpy(), rendering.depth.numpy(), strict=True):
-            filled, share = fill_holes(rgb, alpha)
-            holes.append(share)
-            known = (alpha >= HOLE_ALPHA) & scene.priors.metric
-            yield Picture(filled, np.where(known, depth, np.float32(0)))
+    """The scene through another camera, holes filled; the share of holes is logged at the end.
+
+    `frames` (int, [t]) are those that the poses of `camera` belong to; default: all.
+    """
+    frames = torch.arange(len(scene.camera)) if frames is None else frames
+    window = torch.searchsorted(torch.tensor(scene.starts), frames, right=True) - 1
+    holes: list[float] = []
+    for index, count in zip(
+        *(values.tolist() for values in window.unique_consecutive(return_counts=True)), strict=True
+    ):
+        part = slice(len(holes), len(holes) + count)
+        result, times = scene.results[index], frames[part] - scene.starts[index]
+        for rendering in render_frames(result.scene, camera.select(part), times):
+            drawn = (rendering.rgb.clamp(0, 1) * 255).round().to(torch.uint8)
+            for rgb, alpha, depth in zip(drawn.numpy(), rendering.alpha.numpy(), rendering.depth.numpy(), strict=True):
+                filled, share = fill_holes(rgb, alpha)
+                holes.append(share)
+                yield Picture(filled, np.where((alpha >= HOLE_ALPHA) & scene.metric, depth, np.float32(0)))
     logger.info("%.1f %% of the pixels were filled in (worst frame %.1f %%)", 100 * np.mean(holes), 100 * max(holes))
 
 
