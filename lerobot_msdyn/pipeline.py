@@ -37,6 +37,7 @@ from lerobot_msdyn.write import NewEpisode, OutputDataset
 
 logger = logging.getLogger(__name__)
 
+DEPTH_PROVIDERS = ("auto", "recorded", "plane")  # anything else is a file
 FURTHER_STEPS = 0.6  # share of the fit's steps that suffices where the static set has been fitted already
 
 Backgrounds = Mapping[str, Sequence[SharedBackground]]  # by camera
@@ -174,7 +175,7 @@ def reconstruct(
 def _windows(view: View, recipe: Recipe) -> list[tuple[int, View]]:
     """First frames and parts of a video, of about equal length; depth from a file is for the whole video."""
     frames = len(view.rgb)
-    count = 1 if recipe.priors.depth not in ("auto", "recorded", "plane") else -(-frames // recipe.fit.window_frames)
+    count = 1 if recipe.priors.depth not in DEPTH_PROVIDERS else -(-frames // recipe.fit.window_frames)
     bounds = [round(i * frames / count) for i in range(count + 1)]
     parts = []
     for start, end in itertools.pairwise(bounds):
