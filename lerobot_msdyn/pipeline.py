@@ -16,6 +16,7 @@ from torch import Tensor
 from lerobot_msdyn.background import empty_scene
 from lerobot_msdyn.cameras import CameraTrack
 from lerobot_msdyn.config import Recipe
+from lerobot_msdyn.depth_edges import sharpened
 from lerobot_msdyn.episode import View, depth_key_of, read_episode
 from lerobot_msdyn.errors import EpisodeError
 from lerobot_msdyn.fitting import FitResult, fit
@@ -191,6 +192,8 @@ def _fit_window(
     steps = recipe.fit.steps
     with _one_torch_thread():
         priors = estimate_priors(view, recipe.priors, recipe.camera)
+        if recipe.priors.depth not in DEPTH_PROVIDERS:
+            priors = replace(priors, depth=sharpened(priors.depth))
         empty = empty_scene(view.rgb, priors.depth, priors.instances)
         shared = next((background for background in backgrounds if background.fits(view)), None)
         if shared is not None:
