@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 MAX_EPISODES = 8  # that are looked at
 FRAMES_EACH = 20
 MAX_SHIFT_PX = 1.0  # of a camera between episodes that still count as seen by the same
-SURE_FRAMES = 3  # in which an episode must show a pixel itself, or else the other episodes are asked
+SURE_FRAMES = 3  # in which a pixel of the pooled episodes must be seen to count
 ALIKE_GREY_LEVELS = 12.0  # difference up to which two pictures show the same
 ALIKE_DEPTH = 0.02  # relative difference up to which depths are of one surface
 AFFINE_ROUNDS = 3
@@ -79,7 +79,7 @@ def few_frames(view: View) -> View:
 
 def completed(own: EmptyScene, shared: EmptyScene) -> EmptyScene:
     """An episode's empty scene, with what it never shows taken from the shared one, in the episode's own colours."""
-    take = (own.seen < SURE_FRAMES) & (shared.seen >= SURE_FRAMES)
+    take = (own.seen == 0) & (shared.seen >= SURE_FRAMES)
     if not bool(take.any()):
         return own
     colours = colour_match(shared, own).applied(shared.rgb)
