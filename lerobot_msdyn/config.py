@@ -48,6 +48,8 @@ class SceneConfig:
     moving_gaussians: int = 20_000
     # Number of frames from which the moving set is gathered.
     moving_frames: int = 20
+    # Pixels along the border of a mask, and beside depth edges, from which no moving point is taken.
+    mask_border_px: int = 1
     # Side of the voxels in which the gathered moving points are merged, in pixels of the fitted image.
     moving_voxel_px: float = 0.8
 
@@ -219,6 +221,7 @@ _RANGES: dict[str, tuple[tuple[str, float, float], ...]] = {
         ("static_gaussians", 100, 10_000_000),
         ("moving_gaussians", 0, 10_000_000),
         ("moving_frames", 1, 100_000),
+        ("mask_border_px", 0, 100),
         ("moving_voxel_px", 0.05, 100),
     ),
     "MotionConfig": (("max_parts", 1, 64),),

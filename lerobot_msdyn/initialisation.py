@@ -70,7 +70,7 @@ def gather_moving(
     frames = torch.linspace(0, len(view.rgb) - 1, count).round().long().unique().tolist()
     gathered, parts = [], []
     for frame in frames:
-        inside = _certain(priors.instances[frame] > 0, priors.depth[frame]).reshape(-1)
+        inside = _certain(priors.instances[frame] > 0, priors.depth[frame], config.mask_border_px).reshape(-1)
         if not bool(inside.any()):
             continue
         pixels, _ = pixel_gaussians(view.rgb[frame], fill_depth(priors.depth[frame]), view.camera, frame)
@@ -156,9 +156,9 @@ def merge_voxels(gaussians: Gaussians, part: Int[Tensor, " n"], voxel: float) ->
     return merged, part[first]
 
 
-def _certain(mask: Bool[Tensor, "h w"], depth: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
-    """Pixels well inside a mask, of known depth, and not at a depth edge."""
-    window = np.ones((2 * MASK_BORDER_PX + 1,) * 2, np.uint8)
+def _certain(mask: Bool[Tensor, "h w"], depth: Float[Tensor, "h w"], border: int) -> Bool[Tensor, "h w"]:
+    """Pixels `border` px inside a mask, of known depth, and as far from depth edges."""
+    window = np.ones((2 * border + 1,) * 2, np.uint8)
     inside = cv2.erode(mask.numpy().astype(np.uint8), window, borderType=cv2.BORDER_REPLICATE) > 0
     z = depth.numpy()
     edge = cv2.dilate(z, window) > (1 + EDGE_JUMP) * cv2.erode(z, window)

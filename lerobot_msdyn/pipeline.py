@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lerobot_msdyn.background import empty_scene
 from lerobot_msdyn.cameras import CameraTrack
-from lerobot_msdyn.config import Recipe
+from lerobot_msdyn.config import Recipe, SceneConfig
 from lerobot_msdyn.depth_edges import sharpened
 from lerobot_msdyn.episode import View, depth_key_of, read_episode
 from lerobot_msdyn.errors import EpisodeError
@@ -39,6 +39,8 @@ from lerobot_msdyn.write import NewEpisode, OutputDataset
 logger = logging.getLogger(__name__)
 
 DEPTH_PROVIDERS = ("auto", "recorded", "plane")  # anything else is a file
+ROUGH_BORDER_PX = 2  # with depth from a file: from the border of a mask ...
+ROUGH_FRAMES = 6  # ... and so few frames are gathered, whose depths disagree
 FURTHER_STEPS = 0.6  # share of the fit's steps that suffices where the static set has been fitted already
 
 Backgrounds = Mapping[str, Sequence[SharedBackground]]  # by camera
@@ -189,18 +191,19 @@ def _fit_window(
     view: View, recipe: Recipe, progress: Callable[[float], object], backgrounds: Sequence[SharedBackground]
 ) -> tuple[FitResult, Priors, float]:
     """A fitted scene of one window at the size at which it is fitted, its priors, and its look-at distance (m)."""
-    steps = recipe.fit.steps
+    steps, settings = recipe.fit.steps, recipe.scene
     with _one_torch_thread():
         priors = estimate_priors(view, recipe.priors, recipe.camera)
         if recipe.priors.depth not in DEPTH_PROVIDERS:
             priors = replace(priors, depth=sharpened(priors.depth))
+            settings = _for_rough_depth(settings)
         empty = empty_scene(view.rgb, priors.depth, priors.instances)
         shared = next((background for background in backgrounds if background.fits(view)), None)
         if shared is not None:
             empty = completed(empty, shared.empty)
         priors = replace(priors, empty=empty.rgb)
         distance = look_at_distance(empty.depth)
-        scene = initialise(view, priors, recipe.scene, recipe.motion, empty)
+        scene = initialise(view, priors, settings, recipe.motion, empty)
         if shared is not None and shared.static is not None:
             scene = replace(scene, static=adapted(shared, empty, scene.static))
             steps = round(FURTHER_STEPS * steps)
@@ -214,6 +217,15 @@ def _fit_window(
         progress=lambda done: progress(done / steps),
     )
     return result, priors, distance
+
+
+def _for_rough_depth(scene: SceneConfig) -> SceneConfig:
+    """Settings for depth that is uncertain near edges, and disagrees between frames."""
+    return replace(
+        scene,
+        mask_border_px=max(scene.mask_border_px, ROUGH_BORDER_PX),
+        moving_frames=min(scene.moving_frames, ROUGH_FRAMES),
+    )
 
 
 @contextlib.contextmanager
