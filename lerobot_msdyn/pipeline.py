@@ -101,7 +101,11 @@ def _fitted(background: SharedBackground, recipe: Recipe) -> SharedBackground:
     view = View(empty.rgb[None], camera)
     scene = initialise(view, priors, replace(recipe.scene, moving_gaussians=0), recipe.motion, empty)
     config = replace(recipe.fit, steps=recipe.fit.steps // 2, shadows=False, held_out_frames=0)
-    result = fit(scene, view, priors, config, distance=look_at_distance(empty.depth), seed=recipe.seed)
+    try:
+        result = fit(scene, view, priors, config, distance=look_at_distance(empty.depth), seed=recipe.seed)
+    except EpisodeError as error:
+        logger.warning("shared background: %s; every episode fits its own", error)
+        return background
     return replace(background, static=result.scene.static)
 
 
