@@ -9,13 +9,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lerobot_msdyn.background import background_gaussians, fill_depth, pixel_gaussians
+from lerobot_msdyn.background import EmptyScene, background_gaussians, empty_scene, fill_depth, pixel_gaussians
 from lerobot_msdyn.config import MotionConfig, SceneConfig
 from lerobot_msdyn.episode import View
 from lerobot_msdyn.geometry import project, quaternion_multiply, transform_points
 from lerobot_msdyn.motion.initialise import SceneMotion, scene_motion
 from lerobot_msdyn.priors import Priors
-from lerobot_msdyn.priors.depth import static_depth
 from lerobot_msdyn.scene import DynamicScene, Gaussians, concatenate, isotropic
 
 MASK_BORDER_PX = 1  # pixels along the border of a mask mix two surfaces
@@ -25,7 +24,9 @@ VOXEL_GROWTH = 1.15  # of the voxels' side, until there are few enough
 EDGE_JUMP = 0.03  # relative difference of neighbouring depths beyond which a pixel may lie between two surfaces
 
 
-def initialise(view: View, priors: Priors, scene: SceneConfig, motion: MotionConfig) -> DynamicScene:
+def initialise(
+    view: View, priors: Priors, scene: SceneConfig, motion: MotionConfig, empty: EmptyScene | None = None
+) -> DynamicScene:
     """A scene ready to be fitted.
 
     Args:
@@ -33,9 +34,11 @@ def initialise(view: View, priors: Priors, scene: SceneConfig, motion: MotionCon
         priors: its priors, at the same size.
         scene: numbers of Gaussians.
         motion: the levels of motion.
+        empty: what stands still; default: as this video shows it.
     """
-    background = static_depth(priors.depth, priors.instances)
-    static = background_gaussians(priors.empty, background, view.camera, scene.static_gaussians)
+    if empty is None:
+        empty = empty_scene(view.rgb, priors.depth, priors.instances)
+    static = background_gaussians(empty.rgb, empty.depth, view.camera, scene.static_gaussians)
     found = scene_motion(priors.tracks, priors.depth, view.camera, motion) if scene.moving_gaussians > 0 else None
     if found is None:
         moving = static.select(torch.zeros(0, dtype=torch.long))
@@ -58,7 +61,7 @@ def gather_moving(
     frames = torch.linspace(0, len(view.rgb) - 1, count).round().long().unique().tolist()
     gathered, parts = [], []
     for frame in frames:
-        inside = _certain(priors.instances[frame] > 0, priors.depth[frame]).reshape(-1)
+        inside = _certain(priors.instances[frame] > 0, priors.depth[frame], config.mask_border_px).reshape(-1)
         if not bool(inside.any()):
             continue
         pixels, _ = pixel_gaussians(view.rgb[frame], fill_depth(priors.depth[frame]), view.camera, frame)
@@ -143,9 +146,9 @@ def merge_voxels(gaussians: Gaussians, part: Int[Tensor, " n"], voxel: float) ->
     return merged, part[first]
 
 
-def _certain(mask: Bool[Tensor, "h w"], depth: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
-    """Pixels well inside a mask, of known depth, and not at a depth edge."""
-    window = np.ones((2 * MASK_BORDER_PX + 1,) * 2, np.uint8)
+def _certain(mask: Bool[Tensor, "h w"], depth: Float[Tensor, "h w"], border: int) -> Bool[Tensor, "h w"]:
+    """Pixels `border` px inside a mask, of known depth, and as far from depth edges."""
+    window = np.ones((2 * border + 1,) * 2, np.uint8)
     inside = cv2.erode(mask.numpy().astype(np.uint8), window, borderType=cv2.BORDER_REPLICATE) > 0
     z = depth.numpy()
     edge = cv2.dilate(z, window) > (1 + EDGE_JUMP) * cv2.erode(z, window)

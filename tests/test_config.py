@@ -150,5 +150,5 @@ def test_help_answers_without_importing_torch() -> None:
     assert "--fit.steps" in done.stdout
 
 
-def test_the_default_recipe_holds_the_defaults() -> None:
-    assert parse("--recipe", "default") == AugmentConfig()
+def test_the_balanced_recipe_holds_the_defaults() -> None:
+    assert parse("--recipe", "balanced") == AugmentConfig()
