@@ -79,14 +79,14 @@ def test_isotropic_gaussians_are_balls(pushed: tuple[View, Priors]) -> None:
     scene = initialise(*pushed, SceneConfig(isotropic=True), MotionConfig(levels=["object"]))
     assert scene.moving.log_scales.shape == (len(scene.moving), 1)
     assert scene.at(torch.tensor([0])).scales.std(dim=1).max() == 0
-    assert train_psnr(scene, pushed[0]) > 15
+    assert psnr(scene, pushed[0], torch.arange(FRAMES)) > 15
 
 
 @pytest.mark.parametrize("levels", [["object", "primitive"], ["flat"], ["field"]])
 def test_every_model_of_motion_shows_the_video(pushed: tuple[View, Priors], levels: list) -> None:
     scene = initialise(*pushed, SceneConfig(), MotionConfig(levels=levels))
     assert len(scene.levels) == len(levels)
-    assert train_psnr(scene, pushed[0]) > 16
+    assert psnr(scene, pushed[0], torch.arange(FRAMES)) > 16
 
 
 def test_carried_back_by_the_motion_of_their_part() -> None:
