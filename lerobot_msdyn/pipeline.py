@@ -2,19 +2,18 @@
 
 import contextlib
 import logging
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float32, UInt8
 from lerobot.datasets import LeRobotDatasetMetadata
 from torch import Tensor
 
 from lerobot_msdyn.cameras import CameraTrack
 from lerobot_msdyn.config import Recipe
-from lerobot_msdyn.episode import View, depth_key_of, read_episode
+from lerobot_msdyn.episode import View, depth_key_of, read_episode, shrink
 from lerobot_msdyn.fitting import FitResult, fit
 from lerobot_msdyn.initialisation import initialise
 from lerobot_msdyn.perturbation import draw_offset, draw_rng, look_at_distance, perturb
@@ -22,7 +21,7 @@ from lerobot_msdyn.priors import Priors, estimate_priors
 from lerobot_msdyn.priors.depth import static_depth
 from lerobot_msdyn.provenance import SOURCE_VARIANT, Provenance
 from lerobot_msdyn.quality import HOLE_ALPHA, fill_holes
-from lerobot_msdyn.rendering import render_frames, resized
+from lerobot_msdyn.rendering import render_frames
 from lerobot_msdyn.write import NewEpisode, OutputDataset
 
 logger = logging.getLogger(__name__)
@@ -66,7 +65,15 @@ def augment_episode(
     scenes = {}
     for key, view in episode.views.items():
         progress(f"episode {index}: fitting {key}", 0.0)
-        scenes[key] = reconstruct(view, recipe, lambda share: progress("", 0.5 * share / len(cameras)))
+        others = [other for name, other in episode.views.items() if name != key]
+        scenes[key] = reconstruct(
+            view,
+            recipe,
+            lambda share: progress("", 0.5 * share / len(cameras)),
+            others=others,
+            episode=index,
+            key=key,
+        )
     priors = {key: scene.priors.provenance for key, scene in scenes.items()}
     new = []
     if recipe.include_source:
@@ -84,12 +91,22 @@ def augment_episode(
     return new
 
 
-def reconstruct(view: View, recipe: Recipe, progress: Callable[[float], object] = lambda share: None) -> Reconstruction:
-    """Priors, initial scene and fit of one camera's video."""
-    camera = view.camera
+def reconstruct(
+    view: View,
+    recipe: Recipe,
+    progress: Callable[[float], object] = lambda share: None,
+    *,
+    others: Sequence[View] = (),
+    episode: int | None = None,
+    key: str | None = None,
+) -> Reconstruction:
+    """Priors, initial scene and fit of one camera's video; the other arguments are those of `estimate_priors`."""
+    width, height = view.camera.width, view.camera.height
     view = shrink(view, recipe.fit.max_width)
+    others = [shrink(other, recipe.fit.max_width) for other in others]
     with _one_torch_thread():
-        priors = estimate_priors(view, recipe.priors, recipe.camera)
+        priors = estimate_priors(view, recipe.priors, recipe.camera, others=others, episode=episode, key=key)
+        view = replace(view, camera=priors.camera or view.camera)
         distance = look_at_distance(static_depth(priors.depth, priors.instances))
         scene = initialise(view, priors, recipe.scene, recipe.motion)
     result = fit(
@@ -101,7 +118,7 @@ def reconstruct(view: View, recipe: Recipe, progress: Callable[[float], object] 
         seed=recipe.seed,
         progress=lambda steps: progress(steps / recipe.fit.steps),
     )
-    return Reconstruction(result, priors, camera, distance)
+    return Reconstruction(result, priors, view.camera.resized(width, height), distance)
 
 
 @contextlib.contextmanager
@@ -140,17 +157,3 @@ def new_pictures(scene: Reconstruction, camera: CameraTrack, frames: Tensor | No
             known = (alpha >= HOLE_ALPHA) & scene.priors.metric
             yield Picture(filled, np.where(known, depth, np.float32(0)))
     logger.info("%.1f %% of the pixels were filled in (worst frame %.1f %%)", 100 * np.mean(holes), 100 * max(holes))
-
-
-def shrink(view: View, max_width: int) -> View:
-    """The same video with at most `max_width` columns; depth keeps its values (nearest pixel)."""
-    height, width = view.rgb.shape[1:3]
-    if width <= max_width:
-        return view
-    size = (max_width, round(height * max_width / width))
-    rgb = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in view.rgb.numpy()])
-    depth: Float[Tensor, "t h w"] | None = None
-    if view.depth is not None:
-        images = [cv2.resize(image, size, interpolation=cv2.INTER_NEAREST) for image in view.depth.numpy()]
-        depth = torch.from_numpy(np.stack(images))
-    return View(torch.from_numpy(rgb), resized(view.camera, *size), depth, view.depth_range)

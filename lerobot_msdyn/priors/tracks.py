@@ -6,9 +6,12 @@ anchor's patch decide whether the point is seen. Only the part of a patch that l
 what is behind an edge moves differently.
 """
 
+import functools
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,6 +22,8 @@ from torch import Tensor
 
 from lerobot_msdyn.priors.patches import Patches, cut, register, sample
 from lerobot_msdyn.priors.types import PointTracks
+
+PairFlow = Callable[[ndarray, ndarray], ndarray]
 
 _FEW_POINTS, _MANY_POINTS = 400, 1500  # per instance and frame; for fewer the grid is finer, for more coarser
 _EDGE_MARGIN_PX = 2  # of the first points of a track from the edge of their instance ...
@@ -90,6 +95,7 @@ def flow_tracks(
     restart_every: int = 5,
     min_ncc: float = 0.6,
     max_width: int = 480,
+    flow: PairFlow | None = None,
 ) -> PointTracks:
     """Follow points of the moving instances through a clip, forward and backward in time.
 
@@ -98,12 +104,13 @@ def flow_tracks(
     is being followed. Frames wider than `max_width` are tracked at that width; positions are returned in pixels of
     `rgb`. A point is visible where forward and backward flow agree to 1 px + 1 %, its patch correlates with its
     anchor's by more than `min_ncc` and it lies on its instance. Tracks seen in fewer than max(3, 2 %) of the frames are
-    dropped. Confidence is exp(-fb²/2) times the correlation.
+    dropped. Confidence is exp(-fb²/2) times the correlation. `flow` replaces DIS: two colour pictures at the working
+    size -> the flow (px) from the first to the second.
     """
     frames, height, width = instances.shape
     size = (min(width, max_width), max(1, round(height * min(1.0, max_width / width))))
     labels = np.stack([cv2.resize(m, size, interpolation=cv2.INTER_NEAREST) for m in instances.cpu().numpy()])
-    xy, confidence = _follow(_open(rgb, labels), grid, restart_every, min_ncc)
+    xy, confidence = _follow(_open(rgb, labels, flow), grid, restart_every, min_ncc)
     instance, on_instance = _vote(xy, confidence > 0, labels)
     confidence = np.where(on_instance, confidence, np.float32(0))
     kept = (instance > 0) & ((confidence > 0).sum(1) >= max(3, 0.02 * frames))
@@ -116,20 +123,27 @@ def flow_tracks(
     )
 
 
-def _open(rgb: UInt8[Tensor, "t H W 3"], labels: UInt8[ndarray, "t h w"]) -> _Video:
+def _open(rgb: UInt8[Tensor, "t H W 3"], labels: UInt8[ndarray, "t h w"], flow: PairFlow | None) -> _Video:
     """Grey frames of the labels' size, and their flow."""
     size = (labels.shape[2], labels.shape[1])
     frames = rgb.cpu().numpy()
     grey = [cv2.resize(cv2.cvtColor(f, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA) for f in frames]
-    alone = [_without_background(image, mask) for image, mask in zip(grey, labels > 0, strict=True)]
-    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    pairs = list(itertools.pairwise(alone))
+    if flow is None:
+        flow = functools.partial(_dis_flow, cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM))
+        pictures = [_without_background(image, mask) for image, mask in zip(grey, labels > 0, strict=True)]
+    else:
+        pictures = [cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames]
+    pairs = list(itertools.pairwise(pictures))
     return _Video(
         [image.astype(np.float32) for image in grey],
         labels,
-        [dis.calc(a, b, None).astype(np.float16) for a, b in pairs],
-        [dis.calc(b, a, None).astype(np.float16) for a, b in pairs],
+        [flow(a, b).astype(np.float16) for a, b in pairs],
+        [flow(b, a).astype(np.float16) for a, b in pairs],
     )
+
+
+def _dis_flow(dis: Any, a: UInt8[ndarray, "h w"], b: UInt8[ndarray, "h w"]) -> Float32[ndarray, "h w 2"]:
+    return dis.calc(a, b, None)
 
 
 def _without_background(grey: UInt8[ndarray, "h w"], mask: Bool[ndarray, "h w"]) -> UInt8[ndarray, "h w"]:
