@@ -24,7 +24,7 @@ class CameraConfig:
     poses: str = "auto"
     # Horizontal field of view in degrees, used where no calibration names the camera.
     horizontal_fov_deg: float = 60.0
-    # Look for the field of view at which rigid things keep their size; needs depth that is not a plane's (docs/priors.md).
+    # Look for the field of view at which rigid things keep their size; needs depth other than the plane's.
     fov_search: bool = False
     # Height of the camera above the table in metres, used where no depth is recorded.
     height_m: float = 0.5

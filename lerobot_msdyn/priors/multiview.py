@@ -14,12 +14,13 @@ from lerobot_msdyn.episode import View
 from lerobot_msdyn.errors import PriorError
 from lerobot_msdyn.priors.edges import without_flying_pixels
 from lerobot_msdyn.priors.stereo import RectifiedPair, relative_pose
-from lerobot_msdyn.priors.triangulate import matched_points, spread
+from lerobot_msdyn.priors.triangulate import Points, confirmed, find_features, matched_points, spread, without_outliers
 
 _MIN_BASELINE_M = 1e-3
 _MAX_ANGLE_DEG = 60.0  # between the axes of two cameras; beyond it hardly any feature is recognised
 _STEREO_ANGLE_DEG = 15.0  # up to this, semi-global matching of rectified pictures works ...
 _STEREO_FORWARD = 0.5  # ... if no more than this share of the baseline is along the axis
+_STEREO_KNOWN = 0.3  # of the pixels must be matched, else features are tried
 _MIN_POINTS = 20
 
 
@@ -61,7 +62,9 @@ def multiview_depth(view: View, partners: Sequence[View], instances: UInt8[Tenso
     if _is_stereo_pair(view.camera, nearest.camera):
         pair = RectifiedPair(view.camera, nearest.camera)
         frames = zip(view.rgb.numpy(), nearest.rgb.numpy(), strict=True)
-        return without_flying_pixels(torch.from_numpy(np.stack([pair.depth(a, b) for a, b in frames])))
+        depth = without_flying_pixels(torch.from_numpy(np.stack([pair.depth(a, b) for a, b in frames])))
+        if float((depth > 0).float().mean()) > _STEREO_KNOWN:
+            return depth
     points = [_points_at(view, partners, frame) for frame in range(len(view.rgb))]
     return torch.from_numpy(_filled(points, instances.numpy()))
 
@@ -73,16 +76,18 @@ def _is_stereo_pair(camera: CameraTrack, other: CameraTrack) -> bool:
     )
 
 
-def _points_at(view: View, partners: Sequence[View], frame: int) -> Float32[ndarray, "n 3"]:
-    image = view.rgb[frame].numpy()
-    found = [matched_points(image, other.rgb[frame].numpy(), view.camera, other.camera) for other in partners]
+def _points_at(view: View, partners: Sequence[View], frame: int) -> Points:
+    own = find_features(view.rgb[frame].numpy())
+    found = [
+        matched_points(own, find_features(other.rgb[frame].numpy()), view.camera, other.camera) for other in partners
+    ]
     return np.concatenate(found)
 
 
-def _filled(points: list[Float32[ndarray, "n 3"]], instances: UInt8[ndarray, "t h w"]) -> Float32[ndarray, "t h w"]:
+def _filled(points: list[Points], instances: UInt8[ndarray, "t h w"]) -> Float32[ndarray, "t h w"]:
     """Points of every frame, spread over the background and over each instance."""
     labels = [instance_of(found, instances[frame]) for frame, found in enumerate(points)]
-    still = np.concatenate([found[label == 0] for found, label in zip(points, labels, strict=True)])
+    still = confirmed([found[label == 0] for found, label in zip(points, labels, strict=True)])
     if len(still) < _MIN_POINTS:
         raise PriorError(
             f"stereo: only {len(still)} features of the background were found in other cameras over {len(points)} "
@@ -91,7 +96,7 @@ def _filled(points: list[Float32[ndarray, "n 3"]], instances: UInt8[ndarray, "t 
     background = spread(still, np.ones(instances.shape[1:], bool))
     depth = np.repeat(background[None], len(points), axis=0)
     for number in range(1, int(instances.max()) + 1):
-        own = [found[label == number] for found, label in zip(points, labels, strict=True)]
+        own = [without_outliers(found[label == number]) for found, label in zip(points, labels, strict=True)]
         seen = [frame for frame, found in enumerate(own) if len(found)]
         if not seen:
             continue  # it keeps the depth of the background
@@ -103,7 +108,7 @@ def _filled(points: list[Float32[ndarray, "n 3"]], instances: UInt8[ndarray, "t 
     return depth
 
 
-def instance_of(points: Float32[ndarray, "n 3"], instances: UInt8[ndarray, "h w"]) -> UInt8[ndarray, " n"]:
+def instance_of(points: Points, instances: UInt8[ndarray, "h w"]) -> UInt8[ndarray, " n"]:
     """Instance under each point (x, y px first)."""
     height, width = instances.shape
     return instances[points[:, 1].astype(int).clip(0, height - 1), points[:, 0].astype(int).clip(0, width - 1)]

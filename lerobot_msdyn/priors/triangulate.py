@@ -4,6 +4,8 @@ Sparse and rough: a few hundred points carry the whole image. Better than a tabl
 match for a depth sensor.
 """
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
@@ -12,32 +14,68 @@ from numpy import ndarray
 from lerobot_msdyn.cameras import CameraTrack
 from lerobot_msdyn.priors.stereo import relative_pose
 
-_FEATURES = 4000
+type Points = Float32[ndarray, "n 3"]  # x, y (px) and z-depth (m)
+
+_FEATURES = 3000
 _RATIO = 0.8  # of the best match's distance to the second best
 _EPIPOLAR_PX = 1.5
 _MIN_PARALLAX_DEG = 1.0
 _REPROJECTION_PX = 2.0
+_MIN_FRAMES = 3  # in which a point of the background is found ...
+_SAME_DEPTH = 0.1  # ... at the same depth, up to this share
+_OUTLIER = 4.0  # times the median difference to the median
 _CELL = 8  # px; points are thinned to their median inverse depth per cell
 
 
-def matched_points(
-    image: UInt8[ndarray, "h w 3"],
-    other_image: UInt8[ndarray, "h2 w2 3"],
-    camera: CameraTrack,
-    other: CameraTrack,
-) -> Float32[ndarray, "n 3"]:
+@dataclass(frozen=True)
+class Features:
+    """Recognisable points of a picture."""
+
+    xy: Float[ndarray, "n 2"]  # px
+    descriptors: Float32[ndarray, "n d"]
+
+
+def find_features(image: UInt8[ndarray, "h w 3"]) -> Features:
+    """SIFT features (Lowe, IJCV 2004) of a picture whose contrast is evened out: cameras differ in exposure."""
+    points, descriptors = cv2.SIFT.create(_FEATURES, contrastThreshold=0.02).detectAndCompute(_equalised(image), None)
+    if descriptors is None:
+        return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
+    return Features(np.array([point.pt for point in points]) + 0.5, descriptors)
+
+
+def matched_points(found: Features, others: Features, camera: CameraTrack, other: CameraTrack) -> Points:
     """x, y (px) and z-depth (m) in `camera` of features that both pictures show and that fit the calibration."""
-    nothing = np.zeros((0, 3), np.float32)
-    sift = cv2.SIFT.create(_FEATURES, contrastThreshold=0.02)
-    found = [sift.detectAndCompute(_equalised(picture), None) for picture in (image, other_image)]
-    if any(descriptors is None or len(descriptors) < 2 for _, descriptors in found):
-        return nothing
-    pairs = _mutual(found[0][1], found[1][1])
-    if len(pairs) == 0:
-        return nothing
-    a = np.array([found[0][0][i].pt for i, _ in pairs]) + 0.5
-    b = np.array([found[1][0][j].pt for _, j in pairs]) + 0.5
-    return _triangulated(a, b, camera, other)
+    if min(len(found.xy), len(others.xy)) < 2:
+        return np.zeros((0, 3), np.float32)
+    pairs = np.array(_mutual(found.descriptors, others.descriptors), int).reshape(-1, 2)
+    return _triangulated(found.xy[pairs[:, 0]], others.xy[pairs[:, 1]], camera, other)
+
+
+def confirmed(points: list[Points]) -> Points:
+    """The points of a fixed background, gathered over the frames, that several frames put at about the same depth.
+
+    Chance matches happen once; what is there is found again at the same place.
+    """
+    frame = np.repeat(np.arange(len(points)), [len(found) for found in points])
+    gathered = np.concatenate(points)
+    cells = np.floor(gathered[:, :2] / _CELL).astype(int)
+    kept = np.zeros(len(gathered), bool)
+    _, cell = np.unique(cells, axis=0, return_inverse=True)
+    for index in range(int(cell.max()) + 1 if len(cell) else 0):
+        rows = np.nonzero(cell == index)[0]
+        z = gathered[rows, 2]
+        alike = np.abs(z / np.median(z) - 1) < _SAME_DEPTH
+        kept[rows[alike]] = len(np.unique(frame[rows[alike]])) >= _MIN_FRAMES
+    return gathered[kept]
+
+
+def without_outliers(points: Points) -> Points:
+    """The points of one thing, without those whose depth is far from the usual one."""
+    if len(points) == 0:
+        return points
+    inverse = 1 / points[:, 2]
+    off = np.abs(inverse - np.median(inverse))
+    return points[off <= _OUTLIER * max(float(np.median(off)), 0.02 * float(np.median(inverse)))]
 
 
 def _equalised(image: UInt8[ndarray, "h w 3"]) -> UInt8[ndarray, "h w"]:
