@@ -22,7 +22,7 @@ class CameraTrack:
     world_from_camera: Float[Tensor, "t 4 4"]  # m
     width: int
     height: int
-    origin: str = "assumed"  # or: calibration, exchange, sfm, field-of-view search
+    origin: str = "assumed"  # or: calibration, exchange, sfm, fov_search
 
     def __len__(self) -> int:
         return self.intrinsics.shape[0]

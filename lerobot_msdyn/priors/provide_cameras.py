@@ -4,17 +4,18 @@ import logging
 from dataclasses import replace
 
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from lerobot_msdyn.cameras import CameraTrack
+from lerobot_msdyn.cameras import CameraTrack, intrinsics_from_fov
 from lerobot_msdyn.errors import PriorError
 from lerobot_msdyn.geometry import invert_se3
 from lerobot_msdyn.priors.camera_motion import FIXED_PX, SWAY_PX, camera_motion_px
+from lerobot_msdyn.priors.focal import fov_from_rigid_motion
 from lerobot_msdyn.priors.provide_masks import file_origin
 from lerobot_msdyn.priors.request import FILE, Request
 from lerobot_msdyn.priors.sfm import camera_from_sfm
-from lerobot_msdyn.priors.types import Origin
+from lerobot_msdyn.priors.types import Origin, PointTracks
 
 logger = logging.getLogger(__name__)
 
@@ -62,3 +63,22 @@ def _from_file(request: Request, pattern: str) -> tuple[CameraTrack, Origin]:
         pose = invert_se3(torch.from_numpy(content.w2c).double()).float()
         camera = replace(camera, world_from_camera=pose)
     return camera, file_origin(content.provenance.get("camera"), pattern)
+
+
+def with_searched_fov(
+    camera: CameraTrack, tracks: PointTracks, depth: Float[Tensor, "t h w"], depth_provider: str
+) -> tuple[CameraTrack, Origin]:
+    """The camera with the field of view at which rigid things keep their size.
+
+    Raises:
+        PriorError: the depth is that of an assumed plane, or nothing turns enough to tell.
+    """
+    if depth_provider == "plane":
+        raise PriorError(
+            "camera.fov_search needs depth that does not depend on the field of view: recorded, learned or from a file"
+        )
+    fov, correlation = fov_from_rigid_motion(tracks, depth.numpy(), camera)
+    intrinsics = camera.intrinsics.clone()
+    intrinsics[:, 0, 0] = intrinsics[:, 1, 1] = intrinsics_from_fov(camera.width, camera.height, fov)[0, 0]
+    why = f"rigid things keep their size at {fov:.1f} degrees (correlation {correlation:.2f})"
+    return replace(camera, intrinsics=intrinsics, origin="fov_search"), Origin("fov_search", why)
