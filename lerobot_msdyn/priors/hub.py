@@ -24,6 +24,8 @@ LICENCES = {
     "depth-anything/Depth-Anything-V2-Metric-Indoor-Base-hf": NON_COMMERCIAL,
     "depth-anything/Depth-Anything-V2-Metric-Indoor-Large-hf": NON_COMMERCIAL,
 }
+# transformers builds the default configuration of EdgeTAM when it loads one, and reads this model's for it.
+COMPANIONS = {"edgetam": "timm/repvit_m1.dist_in1k"}
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,14 @@ def find_model(name: str) -> LocalModel | None:
     return LocalModel(name, Path(config).parent, Path(config).parent.name, licence)
 
 
+def has_companion(provider: str) -> bool:
+    """Whether the configuration that a provider needs besides its model is in the local cache."""
+    name = COMPANIONS.get(provider)
+    return name is None or isinstance(
+        try_to_load_from_cache(name, "config.json", cache_dir=constants.HF_HUB_CACHE), str
+    )
+
+
 def _is_complete(folder: Path) -> bool:
     return (folder / "config.json").is_file() and any(folder.glob("*.safetensors"))
 
@@ -65,6 +75,12 @@ def demand_model(name: str, field: str, provider: str) -> LocalModel:
     if model is None:
         raise PriorError(
             f"{field} is {provider!r}, but the model {name} is not on this machine; fetch it with: hf download {name}"
+        )
+    if not has_companion(provider):
+        companion = COMPANIONS[provider]
+        raise PriorError(
+            f"{field} is {provider!r}, which needs the configuration of {companion} as well; "
+            f"fetch it with: hf download {companion} config.json"
         )
     return model
 

@@ -7,7 +7,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from lerobot_msdyn.errors import PriorError
-from lerobot_msdyn.priors.hub import LocalModel, demand_model, find_model, has_library
+from lerobot_msdyn.priors.hub import LocalModel, demand_model, find_model, has_companion, has_library
 from lerobot_msdyn.priors.masks import moving_instances, temporal_median
 from lerobot_msdyn.priors.request import FILE, Candidate, Request, first_that_works
 from lerobot_msdyn.priors.sam2 import sam2_masks
@@ -39,7 +39,7 @@ def _models(request: Request) -> dict[str, str]:
 
 
 def _candidates(request: Request) -> list[Candidate[Masks]]:
-    found = {name: find_model(model) for name, model in _models(request).items()}
+    found = {name: find_model(model) for name, model in _models(request).items() if has_companion(name)}
     if not has_library("transformers"):
         found = {}
     learned = [

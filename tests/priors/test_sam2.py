@@ -1,9 +1,11 @@
 """SAM 2 and EdgeTAM, with random weights: what goes in and comes out, not how good it is."""
 
+import json
 from pathlib import Path
 
 import pytest
 import torch
+from huggingface_hub import constants
 
 pytest.importorskip("transformers")
 
@@ -25,9 +27,20 @@ def video() -> tuple[torch.Tensor, torch.Tensor]:
     return rgb, prompts
 
 
-@pytest.mark.filterwarnings("ignore::UserWarning", "ignore::FutureWarning", "ignore::DeprecationWarning")
+@pytest.fixture
+def timm_config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What `hf download timm/repvit_m1.dist_in1k config.json` leaves, as far as it is read."""
+    folder = tmp_path / "hub" / "models--timm--repvit_m1.dist_in1k"
+    (folder / "snapshots" / "0123").mkdir(parents=True)
+    (folder / "refs").mkdir()
+    (folder / "refs" / "main").write_text("0123")
+    content = {"architecture": "repvit_m1", "num_classes": 1000, "num_features": 384, "pretrained_cfg": {}}
+    (folder / "snapshots" / "0123" / "config.json").write_text(json.dumps(content))
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
+
+
 @pytest.mark.parametrize("save", [save_sam2, save_edgetam], ids=["sam2", "edgetam"])
-def test_prompted_instances_are_followed_through_the_clip(save, tmp_path: Path, video) -> None:
+def test_prompted_instances_are_followed_through_the_clip(save, tmp_path: Path, timm_config: None, video) -> None:
     if save is save_edgetam:
         pytest.importorskip("timm")
     model = find_model(str(save(tmp_path / "model")))
