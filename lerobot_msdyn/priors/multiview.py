@@ -71,9 +71,8 @@ def multiview_depth(view: View, partners: Sequence[View], instances: UInt8[Tenso
 
 def _is_stereo_pair(camera: CameraTrack, other: CameraTrack) -> bool:
     pose = relative_pose(camera, other)
-    return _angle_deg(camera, other) < _STEREO_ANGLE_DEG and abs(pose[2, 3]) < _STEREO_FORWARD * np.linalg.norm(
-        pose[:3, 3]
-    )
+    forward = abs(pose[2, 3]) / np.linalg.norm(pose[:3, 3])
+    return bool(_angle_deg(camera, other) < _STEREO_ANGLE_DEG and forward < _STEREO_FORWARD)
 
 
 def _points_at(view: View, partners: Sequence[View], frame: int) -> Points:

@@ -24,7 +24,15 @@ class RectifiedPair:
         self._size, self._other_size = (camera.width, camera.height), (other.width, other.height)
         nothing = np.zeros(5)
         self._turn, turn_other, self._p, p_other, *_ = cv2.stereoRectify(
-            self._k, nothing, k_other, nothing, self._size, pose[:3, :3], pose[:3, 3], flags=0, alpha=-1
+            self._k,
+            nothing,
+            k_other,
+            nothing,
+            self._size,
+            pose[:3, :3],
+            pose[:3, 3],
+            flags=cv2.CALIB_ZERO_DISPARITY,
+            alpha=-1,
         )
         self._upright = abs(p_other[0, 3]) >= abs(p_other[1, 3])  # else the cameras stand above each other
         shift = p_other[0, 3] if self._upright else p_other[1, 3]

@@ -14,7 +14,7 @@ from numpy import ndarray
 from lerobot_msdyn.cameras import CameraTrack
 from lerobot_msdyn.priors.stereo import relative_pose
 
-type Points = Float32[ndarray, "n 3"]  # x, y (px) and z-depth (m)
+type Points = Float32[ndarray, "_ 3"]  # x, y (px) and z-depth (m)
 
 _FEATURES = 3000
 _RATIO = 0.8  # of the best match's distance to the second best
