@@ -14,7 +14,7 @@ from lerobot_msdyn.config import PriorsCommandConfig
 from lerobot_msdyn.errors import ConfigError, EpisodeError, OutputError
 
 if TYPE_CHECKING:
-    from lerobot.datasets import LeRobotDatasetMetadata
+    from lerobot_msdyn.episode import Episode
 
 logger = logging.getLogger(__name__)
 
@@ -28,16 +28,17 @@ def run(arguments: list[str]) -> int:
     for name, given in (("repo", config.repo_id != ""), ("out", config.out != Path())):
         if not given:
             raise ConfigError(f"--{name} is missing; expected: {COMMAND} --repo NAME [--root FOLDER] --out DIR")
-    from lerobot_msdyn.episode import open_source, select_cameras, select_episodes
+    from lerobot_msdyn.episode import open_source, read_episode, select_cameras, select_episodes
 
     source = open_source(config.repo_id, config.root)
     cameras = select_cameras(source, config.cameras)
-    failures = []
     wanted = [config.episodes] if isinstance(config.episodes, int) else config.episodes
     episodes = select_episodes(source, wanted)
+    failures = []
     for index in episodes:
         try:
-            one_episode(source, index, cameras, config)
+            recorded = config.priors.depth != "plane"
+            one_episode(read_episode(source, index, cameras, config.camera, recorded_depth=recorded), config)
         except EpisodeError as error:
             logger.error("skipped: %s", error)
             failures.append(error)
@@ -46,39 +47,38 @@ def run(arguments: list[str]) -> int:
     return EXIT_SOME_EPISODES_FAILED if failures else EXIT_OK
 
 
-def one_episode(source: "LeRobotDatasetMetadata", index: int, cameras: list[str], config: PriorsCommandConfig) -> None:
+def one_episode(episode: "Episode", config: PriorsCommandConfig) -> None:
     """Write an exchange file per camera and one contact sheet.
 
     Raises:
-        EpisodeError: the episode cannot be read.
         PriorError: a prior was demanded and cannot be had.
         OutputError: the folder cannot be written.
     """
     import cv2
 
-    from lerobot_msdyn.episode import read_episode, shrink
+    from lerobot_msdyn.episode import shrink
     from lerobot_msdyn.priors import estimate_priors
     from lerobot_msdyn.priors.exchange import from_priors, write_exchange
     from lerobot_msdyn.priors.sheet import contact_sheet
 
-    episode = read_episode(source, index, cameras, config.camera, recorded_depth=config.priors.depth != "plane")
+    index, name = episode.source.index, f"episode_{episode.source.index:06d}"
     views = {key: shrink(view, config.fit.max_width) for key, view in episode.views.items()}
     videos = []
-    folder = config.out / f"episode_{index:06d}"
     for key, view in views.items():
         start = time.perf_counter()
-        others = [other for name, other in views.items() if name != key]
+        others = [other for camera, other in views.items() if camera != key]
         priors = estimate_priors(view, config.priors, config.camera, others=others, episode=index, key=key)
         seconds = time.perf_counter() - start
-        path = folder / f"{key}.npz"
+        path = config.out / name / f"{key}.npz"
         try:
             write_exchange(path, from_priors(view, priors, index, key))
         except OSError as error:
-            raise OutputError(f"{path} cannot be written ({error})") from error
+            raise OutputError(f"{path} cannot be written ({error}); choose another folder by --out") from error
         sys.stdout.write(f"{path}  {len(view.rgb)} frames in {seconds:.1f} s\n")
-        videos.append((f"{source.repo_id} episode {index}, {key}", view, priors))
-    picture = config.out / f"episode_{index:06d}.png"
-    if not cv2.imwrite(str(picture), contact_sheet(videos, source.fps, config.columns)[..., ::-1]):
+        videos.append((f"{episode.source.repo_id} episode {index}, {key}", view, priors))
+    picture = config.out / f"{name}.png"
+    sheet = contact_sheet(videos, episode.fps, config.columns)
+    if not cv2.imwrite(str(picture), cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR)):
         raise OutputError(f"{picture} cannot be written")
     sys.stdout.write(f"{picture}\n")
 
