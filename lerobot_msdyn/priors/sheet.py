@@ -32,7 +32,7 @@ PALETTE = np.array(
 )
 
 
-def contact_sheet(videos: Sequence[tuple[str, View, Priors]], fps: float, columns: int) -> UInt8[ndarray, "h w 3"]:
+def contact_sheet(videos: Sequence[tuple[str, View, Priors]], fps: int, columns: int) -> UInt8[ndarray, "_ _ 3"]:
     """Per camera (name, video, priors) four rows, over evenly spread frames: picture, instances, depth, tracks."""
     blocks = [_block(name, view, priors, fps, columns) for name, view, priors in videos]
     width = max(block.shape[1] for block in blocks)
@@ -43,13 +43,13 @@ def contact_sheet(videos: Sequence[tuple[str, View, Priors]], fps: float, column
     return np.concatenate(padded)
 
 
-def _block(name: str, view: View, priors: Priors, fps: float, columns: int) -> UInt8[ndarray, "h w 3"]:
+def _block(name: str, view: View, priors: Priors, fps: int, columns: int) -> UInt8[ndarray, "_ _ 3"]:
     frames = np.unique(np.linspace(0, len(view.rgb) - 1, columns).round().astype(int)).tolist()
     rgb = view.rgb.numpy()
     near, far = depth_range(priors)
     tail = max(1, round(_TAIL_S * fps))
     instances = f"{int(priors.instances.max())} instances"
-    rows: list[tuple[str, list[UInt8[ndarray, "h w 3"]]]] = [
+    rows: list[tuple[str, list[UInt8[ndarray, "_ _ 3"]]]] = [
         (f"{name}, {rgb.shape[2]}x{rgb.shape[1]}, {len(rgb)} frames", [rgb[t] for t in frames]),
         (
             _said(priors, "masks", instances),
@@ -80,7 +80,7 @@ def _said(priors: Priors, prior: str, more: str) -> str:
     return f"{prior}: {entry.get('provider', '')}{model}; {more}"
 
 
-def _strip(text: str, pictures: list[UInt8[ndarray, "h w 3"]]) -> UInt8[ndarray, "h w 3"]:
+def _strip(text: str, pictures: list[UInt8[ndarray, "_ _ 3"]]) -> UInt8[ndarray, "h w 3"]:
     """Pictures side by side at a common width, under a line of text."""
     height = round(_CELL_WIDTH * pictures[0].shape[0] / pictures[0].shape[1])
     cells = []
@@ -126,7 +126,7 @@ def draw_depth(depth: Float32[ndarray, "h w"], near: float, far: float) -> UInt8
     return coloured
 
 
-def _tracks(rgb: UInt8[ndarray, "h w 3"], tracks: PointTracks, frame: int, tail: int) -> UInt8[ndarray, "h w 3"]:
+def _tracks(rgb: UInt8[ndarray, "h w 3"], tracks: PointTracks, frame: int, tail: int) -> UInt8[ndarray, "H W 3"]:
     """The picture, dimmed; dots where points are seen, lines where they were, rings where they were just lost."""
     scale = max(1, round(2 * _CELL_WIDTH / rgb.shape[1]))  # thin lines need pixels
     out = cv2.resize((_DIM * rgb).astype(np.uint8), None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR)

@@ -128,12 +128,13 @@ def _open(rgb: UInt8[Tensor, "t H W 3"], labels: UInt8[ndarray, "t h w"], flow: 
     size = (labels.shape[2], labels.shape[1])
     frames = rgb.cpu().numpy()
     grey = [cv2.resize(cv2.cvtColor(f, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA) for f in frames]
+    alone = [_without_background(image, mask) for image, mask in zip(grey, labels > 0, strict=True)]
+    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    pairs = list(itertools.pairwise(alone))
     if flow is None:
-        flow = functools.partial(_dis_flow, cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM))
-        pictures = [_without_background(image, mask) for image, mask in zip(grey, labels > 0, strict=True)]
+        flow = functools.partial(_dis_flow, dis)
     else:
-        pictures = [cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames]
-    pairs = list(itertools.pairwise(pictures))
+        pairs = list(itertools.pairwise(cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames))
     return _Video(
         [image.astype(np.float32) for image in grey],
         labels,
