@@ -105,8 +105,12 @@ def reconstruct(
     view = shrink(view, recipe.fit.max_width)
     others = [shrink(other, recipe.fit.max_width) for other in others]
     with _one_torch_thread():
-        priors = estimate_priors(view, recipe.priors, recipe.camera, others=others, episode=episode, key=key)
+        priors = estimate_priors(
+            view, recipe.priors, recipe.camera, others=others, episode=episode, key=key, device=recipe.device
+        )
         view = replace(view, camera=priors.camera or view.camera)
+        if not view.camera.is_static:
+            logger.warning("the camera moves, but the empty scene is built as if it were fixed: expect blur")
         distance = look_at_distance(static_depth(priors.depth, priors.instances))
         scene = initialise(view, priors, recipe.scene, recipe.motion)
     result = fit(

@@ -67,7 +67,9 @@ def one_episode(episode: "Episode", config: PriorsCommandConfig) -> None:
     for key, view in views.items():
         start = time.perf_counter()
         others = [other for camera, other in views.items() if camera != key]
-        priors = estimate_priors(view, config.priors, config.camera, others=others, episode=index, key=key)
+        priors = estimate_priors(
+            view, config.priors, config.camera, others=others, episode=index, key=key, device=config.device
+        )
         seconds = time.perf_counter() - start
         path = config.out / name / f"{key}.npz"
         try:

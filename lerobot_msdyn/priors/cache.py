@@ -23,8 +23,6 @@ import numpy as np
 from jaxtyping import UInt8
 from torch import Tensor
 
-from lerobot_msdyn.errors import PriorError
-
 logger = logging.getLogger(__name__)
 
 Arrays = dict[str, np.ndarray]
@@ -42,8 +40,7 @@ class PriorCache:
     def get(self, prior: str, provider: str, settings: dict[str, Any], compute: Callable[[], Arrays]) -> Arrays:
         """The arrays of an earlier run with these settings, else those that `compute` returns, which are then kept.
 
-        Raises:
-            PriorError: the folder cannot be written.
+        Where the folder cannot be written nothing is kept, and a warning says so.
         """
         if self.folder is None:
             return compute()
@@ -54,7 +51,17 @@ class PriorCache:
             logger.info("%s: taken from %s", prior, path)
             return found
         arrays = compute()
-        _write(path, arrays)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            save_npz(path, arrays)
+        except OSError as error:
+            logger.warning(
+                "%s cannot be written (%s): %s is not kept; priors.cache or %s names another folder",
+                path,
+                error,
+                prior,
+                ENVIRONMENT,
+            )
         return arrays
 
 
@@ -90,17 +97,6 @@ def _read(path: Path) -> Arrays | None:
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         logger.warning("%s is damaged (%s): computed again", path, type(error).__name__)
         return None
-
-
-def _write(path: Path, arrays: Arrays) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        save_npz(path, arrays)
-    except OSError as error:
-        raise PriorError(
-            f"the cache {path.parent} cannot be written ({error}); "
-            f"choose another folder by priors.cache or {ENVIRONMENT}, or priors.cache off"
-        ) from error
 
 
 def save_npz(path: Path, arrays: Arrays) -> None:

@@ -12,7 +12,7 @@ from lerobot_msdyn.priors.hub import LocalModel
 _BATCH = 4  # pictures
 
 
-def predict_depth(rgb: UInt8[Tensor, "t h w 3"], model: LocalModel) -> tuple[Float[Tensor, "t h w"], bool]:
+def predict_depth(rgb: UInt8[Tensor, "t h w 3"], model: LocalModel, device: str) -> tuple[Float[Tensor, "t h w"], bool]:
     """What the network says of every frame, and whether that is metric.
 
     Metric: z-depth in metres of a camera like those of the network's training, so its scale is that of an unknown
@@ -21,7 +21,8 @@ def predict_depth(rgb: UInt8[Tensor, "t h w 3"], model: LocalModel) -> tuple[Flo
     Raises:
         PriorError: the folder does not hold such a model.
     """
-    processor, network, device = _load(model)
+    processor, network = _load(model)
+    network.to(device)
     size = tuple(rgb.shape[1:3])
     frames = []
     for part in rgb.split(_BATCH):
@@ -35,10 +36,9 @@ def predict_depth(rgb: UInt8[Tensor, "t h w 3"], model: LocalModel) -> tuple[Flo
     return (depth.clamp(min=0) if metric else depth), metric
 
 
-def _load(model: LocalModel) -> tuple[Any, Any, str]:
+def _load(model: LocalModel) -> tuple[Any, Any]:
     from transformers import AutoImageProcessor, DepthAnythingForDepthEstimation
 
-    device = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         processor = AutoImageProcessor.from_pretrained(model.folder, local_files_only=True)
         network = DepthAnythingForDepthEstimation.from_pretrained(model.folder, local_files_only=True)
@@ -46,4 +46,4 @@ def _load(model: LocalModel) -> tuple[Any, Any, str]:
         raise PriorError(
             f"{model.name} in {model.folder} is no Depth Anything model ({type(error).__name__})"
         ) from error
-    return processor, network.eval().to(device), device
+    return processor, network.eval()

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from lerobot_msdyn.config import CameraConfig, PriorsConfig
 from lerobot_msdyn.episode import View
 from lerobot_msdyn.priors.cache import open_cache
+from lerobot_msdyn.priors.hub import torch_device
 from lerobot_msdyn.priors.masks import empty_scene, temporal_median
 from lerobot_msdyn.priors.provide_cameras import provide_camera, with_searched_fov
 from lerobot_msdyn.priors.provide_depth import provide_depth
@@ -25,6 +26,7 @@ def estimate_priors(
     others: Sequence[View] = (),
     episode: int | None = None,
     key: str | None = None,
+    device: str = "auto",
 ) -> Priors:
     """Run the providers that the recipe asks for on one camera's video.
 
@@ -35,11 +37,14 @@ def estimate_priors(
         others: videos of the same moments by other cameras, for stereo.
         episode: index of the episode, by which exchange files are found and checked.
         key: feature key of the camera, likewise.
+        device: auto, cpu or cuda, for learned providers.
 
     Raises:
         PriorError: a provider was asked for by name and cannot be had, or an exchange file cannot be used.
     """
-    request = Request(view, config, camera, open_cache(config.cache, view.rgb), others, episode, key)
+    request = Request(
+        view, config, camera, open_cache(config.cache, view.rgb), others, episode, key, torch_device(device)
+    )
     instances, masks_from = provide_masks(request)
     request, camera_from = provide_camera(request, instances)
     (depth, metric), depth_from = provide_depth(request, instances)

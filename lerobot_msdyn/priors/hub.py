@@ -4,6 +4,7 @@ import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
 from huggingface_hub import constants, try_to_load_from_cache
 
 from lerobot_msdyn.errors import PriorError
@@ -91,6 +92,18 @@ def demand_library(module: str, extra: str, field: str, provider: str) -> None:
         raise PriorError(
             f"{field} is {provider!r}, which needs {module}; install it with: pip install 'lerobot_msdyn[{extra}]'"
         )
+
+
+def torch_device(name: str) -> str:
+    """The device that `auto`, `cpu` or `cuda` stands for.
+
+    Raises:
+        PriorError: there is no CUDA device.
+    """
+    available = torch.cuda.is_available()
+    if name == "cuda" and not available:
+        raise PriorError("device is 'cuda', but no CUDA device is there; use --device auto or cpu")
+    return "cuda" if available and name != "cpu" else "cpu"
 
 
 def has_library(module: str) -> bool:

@@ -117,7 +117,7 @@ def _stereo(request: Request, instances: UInt8[Tensor, "t h w"], why: str) -> Fo
 
 def _learned(request: Request, instances: UInt8[Tensor, "t h w"], provider: str, model: LocalModel, why: str) -> Found:
     def compute() -> dict[str, np.ndarray]:
-        values, metric = predict_depth(request.view.rgb, model)
+        values, metric = predict_depth(request.view.rgb, model, request.device)
         return {"values": values.numpy().astype(np.float16), "metric": np.array(metric)}
 
     settings = {"model": model.name, "revision": model.revision}

@@ -68,7 +68,7 @@ def _learned(request: Request, provider: str, model: LocalModel, why: str) -> tu
         raise PriorError(f"priors.masks: {provider} needs something that moves as a prompt, and nothing was found")
 
     def compute() -> dict:
-        return {"masks": sam2_masks(request.view.rgb, prompts, model).numpy()}
+        return {"masks": sam2_masks(request.view.rgb, prompts, model, request.device).numpy()}
 
     settings = {"model": model.name, "revision": model.revision}
     found = request.cache.get("masks", provider, settings, compute)

@@ -50,7 +50,7 @@ def _flow(
     provider = "flow" if model is None else "raft"
 
     def compute() -> dict[str, np.ndarray]:
-        flow = None if model is None else RaftFlow(model)
+        flow = None if model is None else RaftFlow(model, request.device)
         tracks = flow_tracks(request.view.rgb, instances, flow=flow)
         return {name: value.numpy() for name, value in vars(tracks).items()}
 

@@ -51,11 +51,11 @@ def demand_raft(weights: Path | None) -> LocalModel:
 class RaftFlow:
     """Callable: two pictures -> the flow from the first to the second."""
 
-    def __init__(self, model: LocalModel) -> None:
+    def __init__(self, model: LocalModel, device: str) -> None:
         from torchvision.models.optical_flow import raft_small
 
         self._network = raft_small(weights=None).eval()
-        self._device = "cuda" if torch.cuda.is_available() else "cpu"
+        self._device = device
         try:
             if model.folder.suffix == ".safetensors":
                 state = load_file(model.folder)

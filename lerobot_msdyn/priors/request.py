@@ -27,6 +27,7 @@ class Request:
     others: Sequence[View] = ()  # of the same moments, by other cameras
     episode: int | None = None
     key: str | None = None  # of the camera's feature
+    device: str = "cpu"  # on which networks run
     _files: dict[str, Exchange] = field(default_factory=dict)
 
     def exchange(self, pattern: str) -> Exchange:

@@ -21,7 +21,7 @@ _CENTRAL = 0.5  # quantile of an instance's areas to which the best frame's is c
 
 
 def sam2_masks(
-    rgb: UInt8[Tensor, "t h w 3"], prompts: UInt8[Tensor, "t h w"], model: LocalModel
+    rgb: UInt8[Tensor, "t h w 3"], prompts: UInt8[Tensor, "t h w"], model: LocalModel, device: str
 ) -> UInt8[Tensor, "t h w"]:
     """Instances of every frame; `prompts` are weights-free masks, whose instance numbers are kept.
 
@@ -30,7 +30,8 @@ def sam2_masks(
     Raises:
         PriorError: the folder does not hold such a model.
     """
-    processor, network, device = _load(model)
+    processor, network = _load(model)
+    network.to(device)
     best = torch.zeros(prompts.shape, dtype=torch.float16)  # logit; 0 decides between inside and outside
     instances = torch.zeros_like(prompts)
     for instance in range(1, int(prompts.max()) + 1):
@@ -98,10 +99,9 @@ class _Frames:
         return prepared
 
 
-def _load(model: LocalModel) -> tuple[Any, Any, str]:
+def _load(model: LocalModel) -> tuple[Any, Any]:
     from transformers import AutoConfig, EdgeTamVideoModel, Sam2VideoModel, Sam2VideoProcessor
 
-    device = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         kind = AutoConfig.from_pretrained(model.folder, local_files_only=True).model_type
         network_class = EdgeTamVideoModel if kind.startswith("edgetam") else Sam2VideoModel
@@ -112,4 +112,4 @@ def _load(model: LocalModel) -> tuple[Any, Any, str]:
         raise PriorError(
             f"{model.name} in {model.folder} cannot be loaded as a SAM 2 video model ({type(error).__name__}: {line})"
         ) from error
-    return processor, network.eval().to(device), device
+    return processor, network.eval()

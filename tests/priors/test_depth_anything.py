@@ -21,7 +21,7 @@ def test_every_frame_gets_depth_at_its_own_size(kind: str, tmp_path: Path) -> No
     model = find_model(str(save_depth_anything(tmp_path, kind)))
     assert model is not None
     assert (model.revision, model.licence) == ("local", "unknown: read its model card")
-    depth, metric = predict_depth(RGB, model)
+    depth, metric = predict_depth(RGB, model, "cpu")
     assert metric == (kind == "metric")
     assert depth.shape == (5, 48, 64)
     assert torch.isfinite(depth).all()
@@ -35,4 +35,4 @@ def test_a_folder_with_something_else_is_named(tmp_path: Path) -> None:
     model = find_model(str(tmp_path))
     assert model is not None
     with pytest.raises(PriorError, match="no Depth Anything model"):
-        predict_depth(RGB, model)
+        predict_depth(RGB, model, "cpu")

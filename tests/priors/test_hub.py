@@ -3,11 +3,20 @@
 from pathlib import Path
 
 import pytest
+import torch
 from huggingface_hub import constants
 
 from lerobot_msdyn.config import PriorsConfig
 from lerobot_msdyn.errors import PriorError
-from lerobot_msdyn.priors.hub import LICENCES, NON_COMMERCIAL, demand_library, demand_model, find_model, has_library
+from lerobot_msdyn.priors.hub import (
+    LICENCES,
+    NON_COMMERCIAL,
+    demand_library,
+    demand_model,
+    find_model,
+    has_library,
+    torch_device,
+)
 
 SAM2 = "facebook/sam2.1-hiera-tiny"
 
@@ -65,3 +74,12 @@ def test_no_default_is_restricted_to_non_commercial_use() -> None:
     defaults = [getattr(config, name) for name in vars(config) if name.endswith("_model")]
     assert len(defaults) == 4
     assert all(LICENCES[name] != NON_COMMERCIAL for name in defaults)
+
+
+def test_devices(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert [torch_device(name) for name in ("auto", "cpu")] == ["cpu", "cpu"]
+    with pytest.raises(PriorError, match="no CUDA device is there"):
+        torch_device("cuda")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert [torch_device(name) for name in ("auto", "cpu", "cuda")] == ["cuda", "cpu", "cuda"]

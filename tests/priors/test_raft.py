@@ -27,7 +27,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_flow_has_the_size_of_the_pictures(weights: Path) -> None:
-    flow = RaftFlow(demand_raft(weights))(*PAIR)
+    flow = RaftFlow(demand_raft(weights), "cpu")(*PAIR)
     assert flow.shape == (72, 100, 2)
     assert np.isfinite(flow).all()
 
@@ -44,7 +44,7 @@ def test_torchvision_s_own_file_is_found_and_read(
     torch.save(raft_small(weights=None).state_dict(), path)
     model = demand_raft(None)
     assert (model.revision, model.licence) == ("raft_small_C_T_V2-01064c6d", "BSD-3-Clause")
-    RaftFlow(model)
+    RaftFlow(model, "cpu")
 
 
 def test_bad_weights_are_named(tmp_path: Path) -> None:
@@ -53,7 +53,7 @@ def test_bad_weights_are_named(tmp_path: Path) -> None:
     other = tmp_path / "other.safetensors"
     save_file({"x": torch.zeros(1)}, other)
     with pytest.raises(PriorError, match="does not hold the weights of raft_small"):
-        RaftFlow(demand_raft(other))
+        RaftFlow(demand_raft(other), "cpu")
 
 
 def test_the_tracker_uses_the_flow_that_it_is_given(sliding) -> None:

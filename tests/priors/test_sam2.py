@@ -46,7 +46,7 @@ def test_prompted_instances_are_followed_through_the_clip(save, tmp_path: Path, 
     model = find_model(str(save(tmp_path / "model")))
     assert model is not None
     rgb, prompts = video
-    masks = sam2_masks(rgb, prompts, model)
+    masks = sam2_masks(rgb, prompts, model, "cpu")
     assert masks.shape == prompts.shape
     assert set(masks.unique().tolist()) <= {0, 1, 2}
     shown = best_frame(prompts == 1)
@@ -60,7 +60,7 @@ def test_a_folder_with_something_else_is_named(tmp_path: Path, video) -> None:
     model = find_model(str(tmp_path))
     assert model is not None
     with pytest.raises(PriorError, match="cannot be loaded as a SAM 2 video model"):
-        sam2_masks(*video, model)
+        sam2_masks(*video, model, "cpu")
 
 
 def test_the_best_frame_shows_a_whole_thing_of_the_usual_size() -> None:
