@@ -59,17 +59,19 @@ def _candidates(request: Request, instances: UInt8[Tensor, "t h w"]) -> list[Can
     if request.view.depth is not None:
         found.append(Candidate("recorded", "the dataset has it", functools.partial(_recorded, request)))
     missing = "no depth is recorded" if not found else "the recorded depth cannot be used"
-    for name, wanted in _models(request).items():
-        model = find_model(wanted) if has_library("transformers") else None
+    models = {name: find_model(wanted) for name, wanted in _models(request).items() if has_library("transformers")}
+    for name, model in models.items():
         if model is not None:
             run = functools.partial(_learned, request, instances, name, model)
             found.append(Candidate(name, f"{missing}; its model is on this machine", run))
-    missing += ", no learned model is on this machine" if len(found) < 2 else ""
+    missing += ", no learned model " + ("could be used" if any(models.values()) else "is on this machine")
     if usable_partners(request.view, request.others):
         why = f"{missing}; other calibrated cameras see the scene"
         found.append(Candidate("stereo", why, functools.partial(_stereo, request, instances)))
-    why = f"{missing}, no other calibrated camera"
-    found.append(Candidate("plane", why, functools.partial(_plane, request, instances)))
+        missing += ", the other cameras do not help"
+    else:
+        missing += ", no other calibrated camera"
+    found.append(Candidate("plane", missing, functools.partial(_plane, request, instances)))
     return found
 
 
