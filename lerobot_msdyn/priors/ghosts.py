@@ -17,10 +17,10 @@ _STILL = 6  # grey levels up to which two pictures of a place look the same
 _OTHER = 8.0  # Lab units, of the difference to the picture of the empty scene
 _TOGETHER = 0.5  # share of frames that neighbouring pixels rest together, to belong to one place
 _MIN_AREA = 5e-4  # of the image
-_MIN_OUTLINE = 15  # px
+_MIN_OUTLINE = 30  # px
 _BARE = 0.2  # share of the frames for which the outline may be covered
 _STRONGEST = 30.0  # Lab units; stronger edges count no more
-_CLEARLY = 3.0  # Lab units, by which the outline of the one picture must be stronger than that of the other
+_CLEARLY = 1.5  # Lab units, by which the outline of the one picture must be stronger than that of the other
 
 
 def without_ghosts(

@@ -33,6 +33,8 @@ _MIN_EMPTY_FRAMES = 5  # seen empty so often, a pixel's background is known
 _SURELY_EMPTY = -1.0  # log-odds below which a pixel serves for the picture of the empty scene
 _SURE = 3.0  # log-odds beyond which a pixel serves to learn colours
 _MOST_BY_VOTE = 4.0  # log-odds
+_SELDOM = 0.05  # share of the frames; a pixel that changes in fewer may be static
+_MARGIN = 16  # px
 _MIN_AREA = 5e-4  # of the image; smaller blobs are dropped
 
 
@@ -121,27 +123,54 @@ def _moving_pixels(
     noise: Float32[ndarray, "h w"],
 ) -> Bool[ndarray, "t h w"]:
     """Pixels that show something that moves at some time of the clip, even while it rests."""
-    region = _ever_changing(np.stack([along_edges(change(f, median, noise), f) > 0 for f in frames]))
+    changed = np.stack([along_edges(change(frame, median, noise), frame) > 0 for frame in frames])
+    region = _ever_changing(changed)
     if not region.any():
-        return np.zeros(frames.shape[:3], bool)
+        return changed & False
     for_moving, for_empty = votes(frames, region)
+    box = _bounds(region)
+    moving = np.zeros_like(changed)
+    moving[:, *box] = _mended(
+        frames[:, *box], elsewhere[:, *box], median[box], noise[box], region[box], changed[:, *box],
+        for_moving[:, *box], for_empty[:, *box],
+    )
+    return moving
+
+
+def _mended(
+    frames: UInt8[ndarray, "t h w 3"],
+    elsewhere: UInt8[ndarray, "m h w 3"],
+    empty: UInt8[ndarray, "h w 3"],
+    noise: Float32[ndarray, "h w"],
+    region: Bool[ndarray, "h w"],
+    changed: Bool[ndarray, "t h w"],
+    for_moving: Float32[ndarray, "t h w"],
+    for_empty: Float32[ndarray, "t h w"],
+) -> Bool[ndarray, "t h w"]:
+    """Pixels that move, from a first guess of the empty scene and of what differs from it."""
     voted = np.log((for_moving + AUDIBLE / 4) / (for_empty + AUDIBLE / 4)).clip(-_MOST_BY_VOTE, _MOST_BY_VOTE)
-    bare = ~region | ((for_empty > 2 * for_moving) & (for_empty > AUDIBLE))
-    empty, known = _median_where(frames, bare, median), bare.sum(0) >= _MIN_EMPTY_FRAMES
-    del for_moving, for_empty, bare
+    never = changed.mean(0) < _SELDOM
+    bare = ~region | ((for_empty > 2 * for_moving) & (for_empty > AUDIBLE)) | (never & (for_empty >= for_moving))
+    empty, known = _median_where(frames, bare, empty), bare.sum(0) >= _MIN_EMPTY_FRAMES
     chosen = _spread_index(len(frames), _MEND_SAMPLES)
     studied = np.concatenate((frames[chosen], elsewhere))
     hints = np.concatenate((voted[chosen], np.zeros(elsewhere.shape[:3], np.float32)))
     for _ in range(_MEND_PASSES):
         odds, colours = _judged(studied, hints, empty, known, noise, region)
         moving = np.stack([_tidy(image > 0) for image in odds[: len(chosen)]])
-        mended, changed = without_ghosts(studied[: len(chosen)], moving, empty, len(frames) / len(chosen))
+        mended, ghost = without_ghosts(studied[: len(chosen)], moving, empty, len(frames) / len(chosen))
         bare = np.stack([cv2.dilate((o > _SURELY_EMPTY).astype(np.uint8), np.ones((3, 3), np.uint8)) == 0 for o in odds])
-        empty = np.where(changed[..., None], mended, _median_where(studied, bare, empty))
-        known = changed | (bare.sum(0) >= _MIN_EMPTY_FRAMES)
+        empty = np.where(ghost[..., None], mended, _median_where(studied, bare, empty))
+        known = ghost | (bare.sum(0) >= _MIN_EMPTY_FRAMES)
     return np.stack(
         [_tidy(_odds(f, v, empty, known, noise, colours) > 0) for f, v in zip(frames, voted, strict=True)]
     )
+
+
+def _bounds(region: Bool[ndarray, "h w"]) -> tuple[slice, slice]:
+    """The smallest box about a region, with a margin that smoothing may look at."""
+    rows, columns = np.flatnonzero(region.any(1)), np.flatnonzero(region.any(0))
+    return tuple(slice(max(0, index[0] - _MARGIN), index[-1] + 1 + _MARGIN) for index in (rows, columns))
 
 
 def _odds(
