@@ -49,7 +49,8 @@ def _features(
     frame: UInt8[ndarray, "h w 3"], reference: UInt8[ndarray, "h w 3"], noise: Float32[ndarray, "h w"]
 ) -> tuple[ndarray, ...]:
     """Unevenness of the ratio over the channels; change of colour beyond that of lightness; unevenness of the ratio
-    over neighbours; correlation of texture; distance in noise levels; brightening."""
+    over neighbours; correlation of texture; distance in noise levels; brightening.
+    """
     lab, before = to_lab(frame), to_lab(reference)
     distance = np.linalg.norm(lab - before, axis=-1) / noise
     lightness = (lab[..., 0] + 1) / (before[..., 0] + 1)
@@ -94,10 +95,13 @@ def along_edges(odds: Float32[ndarray, "h w"], frame: UInt8[ndarray, "h w 3"]) -
     c_rr, c_rg, c_rb = gg * bb - gb * gb, rb * gb - rg * bb, rg * gb - rb * gg
     c_gg, c_gb, c_bb = rr * bb - rb * rb, rb * rg - rr * gb, rr * gg - rg * rg
     pr, pg, pb = np.moveaxis(with_odds, -1, 0)
-    slope = np.stack(
-        (c_rr * pr + c_rg * pg + c_rb * pb, c_rg * pr + c_gg * pg + c_gb * pb, c_rb * pr + c_gb * pg + c_bb * pb),
-        axis=-1,
-    ) / (rr * c_rr + rg * c_rg + rb * c_rb)[..., None]
+    slope = (
+        np.stack(
+            (c_rr * pr + c_rg * pg + c_rb * pb, c_rg * pr + c_gg * pg + c_gb * pb, c_rb * pr + c_gb * pg + c_bb * pb),
+            axis=-1,
+        )
+        / (rr * c_rr + rg * c_rg + rb * c_rb)[..., None]
+    )
     offset = odds_mean - (slope * guide_mean).sum(-1)
     return (mean(slope) * guide).sum(-1) + mean(offset)
 

@@ -102,9 +102,7 @@ def _goes_on(
     if around.sum() < _MIN_OUTLINE:
         return False
     rim = inside & (cv2.erode(mask, wide) == 0)
-    _, index = cv2.distanceTransformWithLabels(
-        (~rim).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-    )
+    _, index = cv2.distanceTransformWithLabels((~rim).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     nearest = np.zeros(index.max() + 1, int)
     nearest[index[rim]] = np.flatnonzero(rim)
     across = nearest[index[around]]
@@ -113,4 +111,4 @@ def _goes_on(
         step = np.linalg.norm(empty[around] - image.reshape(-1, 3)[across], axis=-1)
         return np.minimum(step, _STRONGEST)
 
-    return float((edge(empty) - edge(seen)).mean()) > _CLEARLY
+    return bool((edge(empty) - edge(seen)).mean() > _CLEARLY)

@@ -1,8 +1,8 @@
 """What moves, without learned weights: difference to a picture of the empty scene, which is mended step by step.
 
 The temporal median goes wrong where an object rests for most of the clip: it is in the median, so it is missed while
-it rests, and the place that it leaves shows up as moving afterwards. Votes of point tracks (`votes`) and the outlines of
-such places (`ghosts`) mend it. A pixel is judged by its difference to that picture (`change`) where the picture is
+it rests, and the place that it leaves shows up as moving afterwards. Votes of point tracks (`votes`) and the outlines
+of such places (`ghosts`) mend it. A pixel is judged by its difference to that picture (`change`) where the picture is
 known, else by the votes, and everywhere by the colours of what moves; neighbours decide together within the edges of
 the frame.
 
@@ -82,7 +82,11 @@ def moving_instances(
     def small(images: ndarray) -> ndarray:
         return np.stack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images])
 
-    frames, (empty,), (spread,) = small(rgb.cpu().numpy()), small(median[None].cpu().numpy()), small(noise[None].numpy())
+    frames, (empty,), (spread,) = (
+        small(rgb.cpu().numpy()),
+        small(median[None].cpu().numpy()),
+        small(noise[None].numpy()),
+    )
     elsewhere = frames[:0] if others is None else small(_spread(others.cpu().numpy(), _MEDIAN_SAMPLES))
     sway = camera_sway(np.concatenate((frames, elsewhere)), empty)
     if sway is not None:
@@ -131,8 +135,14 @@ def _moving_pixels(
     box = _bounds(region)
     moving = np.zeros_like(changed)
     moving[:, *box] = _mended(
-        frames[:, *box], elsewhere[:, *box], median[box], noise[box], region[box], changed[:, *box],
-        for_moving[:, *box], for_empty[:, *box],
+        frames[:, *box],
+        elsewhere[:, *box],
+        median[box],
+        noise[box],
+        region[box],
+        changed[:, *box],
+        for_moving[:, *box],
+        for_empty[:, *box],
     )
     return moving
 
@@ -159,18 +169,19 @@ def _mended(
         odds, colours = _judged(studied, hints, empty, known, noise, region)
         moving = np.stack([_tidy(image > 0) for image in odds[: len(chosen)]])
         mended, ghost = without_ghosts(studied[: len(chosen)], moving, empty, len(frames) / len(chosen))
-        bare = np.stack([cv2.dilate((o > _SURELY_EMPTY).astype(np.uint8), np.ones((3, 3), np.uint8)) == 0 for o in odds])
+        bare = np.stack(
+            [cv2.dilate((o > _SURELY_EMPTY).astype(np.uint8), np.ones((3, 3), np.uint8)) == 0 for o in odds]
+        )
         empty = np.where(ghost[..., None], mended, _median_where(studied, bare, empty))
         known = ghost | (bare.sum(0) >= _MIN_EMPTY_FRAMES)
-    return np.stack(
-        [_tidy(_odds(f, v, empty, known, noise, colours) > 0) for f, v in zip(frames, voted, strict=True)]
-    )
+    return np.stack([_tidy(_odds(f, v, empty, known, noise, colours) > 0) for f, v in zip(frames, voted, strict=True)])
 
 
 def _bounds(region: Bool[ndarray, "h w"]) -> tuple[slice, slice]:
     """The smallest box about a region, with a margin that smoothing may look at."""
     rows, columns = np.flatnonzero(region.any(1)), np.flatnonzero(region.any(0))
-    return tuple(slice(max(0, index[0] - _MARGIN), index[-1] + 1 + _MARGIN) for index in (rows, columns))
+    top, left = max(0, rows[0] - _MARGIN), max(0, columns[0] - _MARGIN)
+    return slice(top, rows[-1] + 1 + _MARGIN), slice(left, columns[-1] + 1 + _MARGIN)
 
 
 def _odds(

@@ -42,11 +42,6 @@ class Patches:
         """Weighted normalised cross-correlation with an image at some positions; two flat patches are alike."""
         return self._compare(self._look(grey, xy))[0]
 
-    def uncertainty_px(self) -> Float32[ndarray, " n"]:
-        """Standard deviation of a registration along the direction in which the texture tells least; at most 2 px."""
-        hessian = np.einsum("npi,npj->nij", self.weights[..., None] * self.gradients, self.gradients)
-        return np.sqrt(_NOISE_VARIANCE / np.maximum(np.linalg.eigvalsh(hessian)[:, 0], 1.0))
-
     def _look(self, grey: Float32[ndarray, "h w"], xy: Float32[ndarray, "n 2"]) -> Float32[ndarray, "n p"]:
         values = _values(grey, xy)
         total = self.weights.sum(1, keepdims=True)
