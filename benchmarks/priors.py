@@ -174,7 +174,7 @@ def measure(folder: Path, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
     if view.rgb.shape[:3] != truth.seg.shape:
         raise SystemExit(f"{name}: the pictures are {tuple(view.rgb.shape[:3])}, the truth {truth.seg.shape}")
     start = time.process_time()
-    priors = estimate_priors(view, PriorsConfig(depth="plane"), CameraConfig())
+    priors = estimate_priors(view, PriorsConfig("plane", "change", "flow", cache="off"), CameraConfig())
     seconds = time.process_time() - start
     found = priors.instances.numpy() > 0
     tracks, more = track_scores(priors.tracks, truth, np.load(folder / scene / "gt" / part / "tracks.npz"))

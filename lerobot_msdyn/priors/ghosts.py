@@ -11,6 +11,7 @@ from jaxtyping import Bool, Int, UInt8
 from numpy import ndarray
 
 from lerobot_msdyn.priors.change import to_lab
+from lerobot_msdyn.priors.medians import median_where
 
 _REST_FRAMES = 8  # of the clip, for which a place has to look the same
 _STILL = 6  # grey levels up to which two pictures of a place look the same
@@ -35,7 +36,7 @@ def without_ghosts(
     """
     resting = _resting(frames, moving, stride)
     often = resting.sum(0) >= max(2, round(_REST_FRAMES / stride))
-    seen = _median(frames, resting, often, empty)
+    seen = median_where(frames, resting, often, empty)
     lab_seen, lab_empty = to_lab(seen), to_lab(empty)
     places = _places(resting, often & (np.linalg.norm(lab_seen - lab_empty, axis=-1) > _OTHER))
     mended, changed = empty.copy(), np.zeros(often.shape, bool)
@@ -57,16 +58,6 @@ def _resting(
     for t in range(step, len(frames)):
         resting[t] = moving[t] & moving[t - step] & (cv2.absdiff(grey[t], grey[t - step]) < _STILL)
     return resting
-
-
-def _median(
-    frames: UInt8[ndarray, "s h w 3"], when: Bool[ndarray, "s h w"], where: Bool[ndarray, "h w"], otherwise: ndarray
-) -> UInt8[ndarray, "h w 3"]:
-    out = otherwise.copy()
-    values = np.where(when[:, where, None], frames[:, where], np.float32(np.nan))
-    if where.any():
-        out[where] = np.nanmedian(values, axis=0).round().astype(np.uint8)
-    return out
 
 
 def _places(resting: Bool[ndarray, "s h w"], where: Bool[ndarray, "h w"]) -> Int[ndarray, "h w"]:

@@ -18,23 +18,24 @@ from jaxtyping import Bool, Float32, Int, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from lerobot_msdyn.priors.change import Colours, along_edges, change, to_lab
+from lerobot_msdyn.priors.boxes import box_about
+from lerobot_msdyn.priors.change import Colours, Reference, along_edges, to_lab
 from lerobot_msdyn.priors.ghosts import without_ghosts
 from lerobot_msdyn.priors.linking import numbered
+from lerobot_msdyn.priors.medians import median_where
 from lerobot_msdyn.priors.stabilise import camera_sway, to_frames, to_reference
 from lerobot_msdyn.priors.votes import AUDIBLE, votes
 
 _MAX_WIDTH = 320  # px
 _MEDIAN_SAMPLES = 60  # frames over which medians are taken
 _NOISE_FLOOR = 1.0  # CIE Lab units
-_MEND_SAMPLES = 90  # frames from which the picture of the empty scene is mended ...
+_MEND_SAMPLES = 60  # frames from which the picture of the empty scene is mended ...
 _MEND_PASSES = 2  # ... so often
 _MIN_EMPTY_FRAMES = 5  # seen empty so often, a pixel's background is known
 _SURELY_EMPTY = -1.0  # log-odds below which a pixel serves for the picture of the empty scene
 _SURE = 3.0  # log-odds beyond which a pixel serves to learn colours
 _MOST_BY_VOTE = 4.0  # log-odds
 _SELDOM = 0.05  # share of the frames; a pixel that changes in fewer may be static
-_MARGIN = 16  # px
 _MIN_AREA = 5e-4  # of the image; smaller blobs are dropped
 
 
@@ -127,12 +128,13 @@ def _moving_pixels(
     noise: Float32[ndarray, "h w"],
 ) -> Bool[ndarray, "t h w"]:
     """Pixels that show something that moves at some time of the clip, even while it rests."""
-    changed = np.stack([along_edges(change(frame, median, noise), frame) > 0 for frame in frames])
+    reference = Reference(median, noise)
+    changed = np.stack([along_edges(reference.change(frame), frame) > 0 for frame in frames])
     region = _ever_changing(changed)
     if not region.any():
         return changed & False
     for_moving, for_empty = votes(frames, region)
-    box = _bounds(region)
+    box = box_about(region)
     moving = np.zeros_like(changed)
     moving[:, *box] = _mended(
         frames[:, *box],
@@ -174,26 +176,20 @@ def _mended(
         )
         empty = np.where(ghost[..., None], mended, _median_where(studied, bare, empty))
         known = ghost | (bare.sum(0) >= _MIN_EMPTY_FRAMES)
-    return np.stack([_tidy(_odds(f, v, empty, known, noise, colours) > 0) for f, v in zip(frames, voted, strict=True)])
-
-
-def _bounds(region: Bool[ndarray, "h w"]) -> tuple[slice, slice]:
-    """The smallest box about a region, with a margin that smoothing may look at."""
-    rows, columns = np.flatnonzero(region.any(1)), np.flatnonzero(region.any(0))
-    top, left = max(0, rows[0] - _MARGIN), max(0, columns[0] - _MARGIN)
-    return slice(top, rows[-1] + 1 + _MARGIN), slice(left, columns[-1] + 1 + _MARGIN)
+    reference = Reference(empty, noise)
+    parts = zip(frames, voted, strict=True)
+    return np.stack([_tidy(_odds(f, vote, known, reference.change(f), colours) > 0) for f, vote in parts])
 
 
 def _odds(
     frame: UInt8[ndarray, "h w 3"],
     vote: Float32[ndarray, "h w"],
-    empty: UInt8[ndarray, "h w 3"],
     known: Bool[ndarray, "h w"],
-    noise: Float32[ndarray, "h w"],
+    difference: Float32[ndarray, "h w"],
     colours: Colours,
 ) -> Float32[ndarray, "h w"]:
     """Log-odds that a pixel belongs to something that moves."""
-    return along_edges(np.where(known, change(frame, empty, noise), vote) + colours.odds(frame), frame)
+    return along_edges(np.where(known, difference, vote) + colours.odds(frame), frame)
 
 
 def _judged(
@@ -205,14 +201,12 @@ def _judged(
     region: Bool[ndarray, "h w"],
 ) -> tuple[Float32[ndarray, "s h w"], Colours]:
     """Log-odds that each pixel belongs to something that moves, and the colours that were learnt on the way."""
-    colours, differences = Colours(), np.stack([change(frame, empty, noise) for frame in frames])
+    reference, colours = Reference(empty, noise), Colours()
+    differences = [reference.change(frame) for frame in frames]
     for frame, difference in zip(frames, differences, strict=True):
         colours.add(frame, np.where(known & region, difference, 0), _SURE)
-    together = [
-        along_edges(np.where(known, difference, vote) + colours.odds(frame), frame)
-        for frame, difference, vote in zip(frames, differences, voted, strict=True)
-    ]
-    return np.stack(together), colours
+    parts = zip(frames, voted, differences, strict=True)
+    return np.stack([_odds(f, vote, known, difference, colours) for f, vote, difference in parts]), colours
 
 
 def _ever_changing(changed: Bool[ndarray, "t h w"]) -> Bool[ndarray, "h w"]:
@@ -238,10 +232,6 @@ def _tidy(mask: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
 def _median_where(
     frames: UInt8[ndarray, "t h w 3"], usable: Bool[ndarray, "t h w"], otherwise: UInt8[ndarray, "h w 3"]
 ) -> UInt8[ndarray, "h w 3"]:
-    """Median colour of every pixel over the frames in which it is usable, or `otherwise`."""
-    out = otherwise.copy()
+    """Median colour of the pixels that are usable in some frames, but not in all; elsewhere `otherwise`."""
     sample = _spread_index(len(frames), _MEDIAN_SAMPLES)
-    partly = usable[sample].any(0) & ~usable[sample].all(0)
-    values = np.where(usable[sample][:, partly, None], frames[sample][:, partly], np.float32(np.nan))
-    out[partly] = np.nanmedian(values, axis=0).round().astype(np.uint8) if partly.any() else out[partly]
-    return out
+    return median_where(frames[sample], usable[sample], ~usable[sample].all(0), otherwise)

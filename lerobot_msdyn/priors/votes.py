@@ -37,7 +37,8 @@ def votes(
     Tracks are followed within a region only.
     """
     everywhere = torch.from_numpy(region.astype(np.uint8)).expand(len(frames), -1, -1).contiguous()
-    return _vote(flow_tracks(torch.from_numpy(frames), everywhere, restart_every=_TRACK_RESTART), frames)
+    tracks = flow_tracks(torch.from_numpy(frames), everywhere, restart_every=_TRACK_RESTART)
+    return _vote(tracks, frames)
 
 
 def _vote(

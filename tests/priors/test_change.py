@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lerobot_msdyn.priors.change import Colours, along_edges, change
+from lerobot_msdyn.priors.change import Colours, Reference, along_edges
 
 NOISE = np.ones((72, 96), np.float32)
 
@@ -15,14 +15,14 @@ def ground(sliding) -> np.ndarray:
 
 def test_noise_is_no_change(ground) -> None:
     noise = np.random.default_rng(0).normal(size=ground.shape) * 2
-    odds = change(np.clip(ground + noise, 0, 255).astype(np.uint8), ground, NOISE)
+    odds = Reference(ground, NOISE).change(np.clip(ground + noise, 0, 255).astype(np.uint8))
     assert (odds < 0).all()
 
 
 def test_another_colour_is_a_change(ground) -> None:
     frame = ground.copy()
     frame[20:40, 30:60] = (200, 60, 40)
-    odds = change(frame, ground, NOISE)
+    odds = Reference(ground, NOISE).change(frame)
     assert (odds[20:40, 30:60] > 0).all()
     assert (odds[:14] < 0).all()
     assert (odds[:, 67:] < 0).all()
@@ -32,7 +32,7 @@ def test_another_colour_is_a_change(ground) -> None:
 def test_a_shadow_is_no_change(ground) -> None:
     frame = ground.copy()
     frame[20:50, 30:70] = (0.6 * frame[20:50, 30:70]).astype(np.uint8)
-    odds = change(frame, ground, NOISE)
+    odds = Reference(ground, NOISE).change(frame)
     assert (odds > 0).mean() < 0.02
 
 
