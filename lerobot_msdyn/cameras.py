@@ -2,6 +2,8 @@
 
 import json
 import math
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,6 +23,7 @@ class CameraTrack:
     world_from_camera: Float[Tensor, "t 4 4"]  # m
     width: int
     height: int
+    origin: str = "assumed"  # or: calibration, exchange, sfm, fov_search
 
     def __len__(self) -> int:
         return self.intrinsics.shape[0]
@@ -41,6 +44,20 @@ class CameraTrack:
     def select(self, frames: slice | list[int] | Tensor) -> "CameraTrack":
         """The camera at some of its frames."""
         return replace(self, intrinsics=self.intrinsics[frames], world_from_camera=self.world_from_camera[frames])
+
+    def resized(self, width: int, height: int) -> "CameraTrack":
+        """The same camera with another number of pixels."""
+        scale = torch.tensor([[width / self.width], [height / self.height], [1.0]], device=self.intrinsics.device)
+        return replace(self, intrinsics=self.intrinsics * scale, width=width, height=height)
+
+
+def concatenated(parts: Sequence[CameraTrack]) -> CameraTrack:
+    """One track of several that follow each other in time."""
+    return replace(
+        parts[0],
+        intrinsics=torch.cat([part.intrinsics for part in parts]),
+        world_from_camera=torch.cat([part.world_from_camera for part in parts]),
+    )
 
 
 def intrinsics_from_fov(width: int, height: int, horizontal_fov_deg: float) -> Float[Tensor, "3 3"]:
@@ -71,8 +88,8 @@ def read_calibration(path: Path, camera: str, episode: int, frames: int, width: 
 
     The file (JSON) holds `{"cameras": {NAME: {"K": 3x3, "R": 3x3, "t": 3}}}` or, where the rig moved between
     episodes, `{"episodes": {"0": {"cameras": {...}}}}`. K is in pixels of the recorded image; R and t (metres) map
-    world to camera (OpenCV); without them the camera's own frame is the world's. NAME is the feature's key or its
-    last part (`front` for `observation.images.front`).
+    world to camera (OpenCV); without them the camera's own frame is the world's. NAME is the feature's key, its
+    last part (`front` for `observation.images.front`), or the number at its end (`0` for `observation.images.cam0`).
 
     Raises:
         PriorError: the file cannot be read or an entry has the wrong shape.
@@ -83,7 +100,7 @@ def read_calibration(path: Path, camera: str, episode: int, frames: int, width: 
         raise PriorError(f"{path}: calibration cannot be read ({error}); expected a JSON file") from error
     section = content.get("episodes", {}).get(str(episode), content)
     cameras = section.get("cameras", {})
-    entry = cameras.get(camera, cameras.get(camera.rsplit(".", 1)[-1]))
+    entry = next((cameras[name] for name in _names(camera) if name in cameras), None)
     if entry is None:
         return None
     try:
@@ -95,4 +112,11 @@ def read_calibration(path: Path, camera: str, episode: int, frames: int, width: 
             f"{path}: camera {camera!r} has no usable K (3x3), R (3x3), t (3): {error}; see docs/calibration.md"
         ) from error
     world_from_camera = invert_se3(se3(rotation, translation)).float()
-    return static_camera(intrinsics, frames, width, height, world_from_camera)
+    return replace(static_camera(intrinsics, frames, width, height, world_from_camera), origin="calibration")
+
+
+def _names(camera: str) -> list[str]:
+    """What a calibration file may call a camera."""
+    last = camera.rsplit(".", 1)[-1]
+    number = re.search(r"\d+$", last)
+    return [camera, last, *([number[0]] if number else [])]

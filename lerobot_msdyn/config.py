@@ -21,8 +21,12 @@ class CameraConfig:
 
     # JSON file with K (and R, t) of each camera, see docs/calibration.md; without it the camera is taken as fixed.
     calibration: Path | None = None
+    # auto (the calibration, else fixed), fixed, sfm (pycolmap, for a moving camera), or an .npz file with K and w2c.
+    poses: str = "auto"
     # Horizontal field of view in degrees, used where no calibration names the camera.
     horizontal_fov_deg: float = 60.0
+    # Look for the field of view at which rigid things keep their size; needs depth other than the plane's.
+    fov_search: bool = False
     # Height of the camera above the table in metres, used where no depth is recorded.
     height_m: float = 0.5
     # Downward tilt of the camera in degrees, used where no depth is recorded.
@@ -33,8 +37,25 @@ class CameraConfig:
 class PriorsConfig:
     """What is known about a video before the fit."""
 
-    # auto (recorded depth if the dataset has it, else the table plane), recorded, plane, or an .npz file.
+    # auto (recorded, else a learned model that is on this machine, else stereo, else plane), recorded, plane,
+    # depth_anything, depth_anything_metric, stereo (two or more calibrated cameras), or an .npz file.
     depth: str = "auto"
+    # auto (a learned model that is on this machine, else change), change, sam2, edgetam, or an .npz file.
+    masks: str = "auto"
+    # auto (raft if its weights are on this machine, else flow), flow, raft, or an .npz file.
+    tracks: str = "auto"
+    # Model of `depth_anything`: an id on the Hugging Face hub or a folder.
+    depth_anything_model: str = "depth-anything/Depth-Anything-V2-Small-hf"
+    # Model of `depth_anything_metric`: an id on the hub or a folder.
+    depth_anything_metric_model: str = "depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf"
+    # Model of `sam2`: an id on the hub or a folder.
+    sam2_model: str = "facebook/sam2.1-hiera-tiny"
+    # Model of `edgetam`: an id on the hub or a folder.
+    edgetam_model: str = "yonigozlan/EdgeTAM-hf"
+    # Weights of torchvision's raft_small for `raft`; default: where torchvision keeps them.
+    raft_weights: Path | None = None
+    # Where computed priors are kept: auto (LEROBOT_MSDYN_CACHE, else ~/.cache/lerobot_msdyn), off, or a folder.
+    cache: str = "auto"
 
 
 @dataclass
@@ -194,6 +215,12 @@ class Recipe:
     fit: FitConfig = field(default_factory=FitConfig)
     perturbation: PerturbationConfig = field(default_factory=OrbitConfig)
 
+    @property
+    def needs_whole_videos(self) -> bool:
+        """Whether a prior is for a whole video: exchange files, and the poses of a moving camera."""
+        sources = (self.priors.depth, self.priors.masks, self.priors.tracks, self.camera.poses)
+        return self.camera.poses == "sfm" or any(source.endswith(".npz") for source in sources)
+
 
 @dataclass
 class AugmentConfig(Recipe):
@@ -214,6 +241,22 @@ class AugmentConfig(Recipe):
 
 
 @dataclass
+class PriorsCommandConfig(Recipe):
+    """`python -m lerobot_msdyn.priors`: compute the priors alone, and draw them."""
+
+    # Source dataset (alias: --repo).
+    repo_id: str = ""
+    # Exact folder of the source dataset; default: LeRobot's home, then the hub.
+    root: Path | None = None
+    # Episodes, e.g. 0 or '[0,3]'; default: all.
+    episodes: list[int] | int | None = None
+    # Where the results go: OUT/episode_000000/<camera>.npz and OUT/episode_000000.png.
+    out: Path = Path()
+    # Columns of the contact sheet.
+    columns: int = 6
+
+
+@dataclass
 class EvaluateConfig(Recipe):
     """`python -m lerobot_msdyn.evaluate nvs`: fit one episode, render its held-out cameras."""
 
@@ -228,6 +271,10 @@ class EvaluateConfig(Recipe):
 def problems(config: object, prefix: str = "") -> list[str]:
     """One line per value that is out of range, over all nested fields; `config` is any of the classes here."""
     lines = []
+    for name, known in _PROVIDERS.get(type(config).__name__, {}).items():
+        value = getattr(config, name)
+        if value not in known and not value.endswith(".npz"):
+            lines.append(f"{prefix}{name} is {value!r}; expected {', '.join(known)} or a file FILE.npz")
     for name, low, high in _RANGES.get(type(config).__name__, ()):
         value = getattr(config, name)
         if not low <= value <= high:
@@ -254,6 +301,15 @@ def _is_hierarchy(levels: list[LevelName]) -> bool:
     return levels[:1] == ["object"] and ascending and ("grain" not in fine or "primitive" in fine)
 
 
+# Class -> field -> what it may be, besides an exchange file.
+_PROVIDERS: dict[str, dict[str, tuple[str, ...]]] = {
+    "CameraConfig": {"poses": ("auto", "fixed", "sfm")},
+    "PriorsConfig": {
+        "depth": ("auto", "recorded", "plane", "depth_anything", "depth_anything_metric", "stereo"),
+        "masks": ("auto", "change", "sam2", "edgetam"),
+        "tracks": ("auto", "flow", "raft"),
+    },
+}
 _ANY = float("inf")
 _RECIPE_RANGES = (("variants", 1, 1000),)
 # Class -> (field, smallest, largest value).
@@ -261,6 +317,7 @@ _RANGES: dict[str, tuple[tuple[str, float, float], ...]] = {
     "Recipe": _RECIPE_RANGES,
     "AugmentConfig": _RECIPE_RANGES,
     "EvaluateConfig": _RECIPE_RANGES,
+    "PriorsCommandConfig": (*_RECIPE_RANGES, ("columns", 1, 100)),
     "CameraConfig": (("horizontal_fov_deg", 5, 170), ("height_m", 0.01, 100), ("tilt_deg", 1, 90)),
     "SceneConfig": (
         ("static_gaussians", 100, 10_000_000),

@@ -81,8 +81,9 @@ def _say_what_is_assumed(source: LeRobotDatasetMetadata, cameras: list[str], con
         )
     if config.priors.depth == "auto" and not all(depth_key_of(source, key) for key in cameras):
         logger.warning(
-            "no recorded depth: scenes are built on a table plane seen from %g m at %g degrees "
-            "(--camera.height_m, --camera.tilt_deg); keep the changes of view small",
+            "no recorded depth: unless a learned model or several calibrated cameras supply it, scenes are built on a "
+            "table plane seen from %g m at %g degrees (--camera.height_m, --camera.tilt_deg); keep the changes of view "
+            "small",
             config.camera.height_m,
             config.camera.tilt_deg,
         )

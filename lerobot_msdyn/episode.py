@@ -242,6 +242,20 @@ def make_camera(key: str, index: int, rgb: UInt8[Tensor, "t h w 3"], config: Cam
     return static_camera(intrinsics_from_fov(width, height, config.horizontal_fov_deg), frames, width, height)
 
 
+def shrink(view: View, max_width: int) -> View:
+    """The same video with at most `max_width` columns; depth keeps its values (nearest pixel)."""
+    height, width = view.rgb.shape[1:3]
+    if width <= max_width:
+        return view
+    size = (max_width, round(height * max_width / width))
+    rgb = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in view.rgb.numpy()])
+    depth: Float[Tensor, "t h w"] | None = None
+    if view.depth is not None:
+        images = [cv2.resize(image, size, interpolation=cv2.INTER_NEAREST) for image in view.depth.numpy()]
+        depth = torch.from_numpy(np.stack(images))
+    return View(torch.from_numpy(rgb), view.camera.resized(*size), depth, view.depth_range)
+
+
 def depth_key_of(meta: LeRobotDatasetMetadata, camera: str) -> str | None:
     """The feature that holds the recorded depth of a colour camera, if there is one (`<camera>_depth`)."""
     return next((key for key in meta.depth_keys if key == f"{camera}_depth"), None)

@@ -10,7 +10,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 
 from lerobot_msdyn.config import Recipe
 from lerobot_msdyn.episode import View, read_episode
-from lerobot_msdyn.pipeline import DEPTH_PROVIDERS, FURTHER_STEPS, by_feature, new_pictures, reconstruct
+from lerobot_msdyn.pipeline import FURTHER_STEPS, by_feature, new_pictures, reconstruct
 from lerobot_msdyn.shared import MAX_EPISODES
 from lerobot_msdyn.staging import stage_pictures
 
@@ -43,7 +43,7 @@ def measure_speeds(source: LeRobotDatasetMetadata, index: int, cameras: list[str
     short = replace(recipe, fit=replace(recipe.fit, steps=PROBE_STEPS, held_out_frames=0))
     prepare_s = step_s = render_s = 0.0
     for key, view in episode.views.items():
-        part = _middle(view) if recipe.priors.depth in DEPTH_PROVIDERS else view  # a file is for the whole episode
+        part = view if recipe.needs_whole_videos else _middle(view)
         ticks: list[float] = []
 
         def tick(share: float, to: list[float] = ticks) -> None:

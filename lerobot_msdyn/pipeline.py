@@ -6,18 +6,17 @@ import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float32, UInt8
 from lerobot.datasets import LeRobotDatasetMetadata
 from torch import Tensor
 
 from lerobot_msdyn.background import empty_scene
-from lerobot_msdyn.cameras import CameraTrack
+from lerobot_msdyn.cameras import CameraTrack, concatenated
 from lerobot_msdyn.config import Recipe, SceneConfig
 from lerobot_msdyn.depth_edges import sharpened
-from lerobot_msdyn.episode import View, depth_key_of, read_episode
+from lerobot_msdyn.episode import View, depth_key_of, read_episode, shrink
 from lerobot_msdyn.errors import EpisodeError
 from lerobot_msdyn.fitting import FitResult, fit
 from lerobot_msdyn.initialisation import initialise
@@ -25,7 +24,7 @@ from lerobot_msdyn.perturbation import draw_offset, draw_rng, look_at_distance, 
 from lerobot_msdyn.priors import PointTracks, Priors, estimate_priors
 from lerobot_msdyn.provenance import SOURCE_VARIANT, Provenance
 from lerobot_msdyn.quality import HOLE_ALPHA, fill_holes
-from lerobot_msdyn.rendering import render_frames, resized
+from lerobot_msdyn.rendering import render_frames
 from lerobot_msdyn.shared import (
     MAX_EPISODES,
     SharedBackground,
@@ -38,7 +37,6 @@ from lerobot_msdyn.write import NewEpisode, OutputDataset
 
 logger = logging.getLogger(__name__)
 
-DEPTH_PROVIDERS = ("auto", "recorded", "plane")  # anything else is a file
 ROUGH_BORDER_PX = 2  # with depth from a file: from the border of a mask ...
 ROUGH_FRAMES = 6  # ... and so few frames are gathered, whose depths disagree
 FURTHER_STEPS = 0.6  # share of the fit's steps that suffices where the static set has been fitted already
@@ -54,7 +52,7 @@ class Reconstruction:
     results: tuple[FitResult, ...]
     starts: tuple[int, ...]  # first frame of each window
     metric: bool  # whether depth is in true metres
-    provenance: dict[str, str]  # prior -> provider and why, of the first window
+    provenance: dict[str, dict[str, str]]  # prior -> provider, why, model; of the first window
     camera: CameraTrack  # at the size of the recorded video
     distance: float  # m, to the look-at point
 
@@ -133,8 +131,16 @@ def augment_episode(
     scenes = {}
     for key, view in episode.views.items():
         progress(f"episode {index}: fitting {key}", 0.0)
-        shared = (backgrounds or {}).get(key, [])
-        scenes[key] = reconstruct(view, recipe, lambda share: progress("", 0.5 * share / len(cameras)), shared)
+        others = [other for name, other in episode.views.items() if name != key]
+        scenes[key] = reconstruct(
+            view,
+            recipe,
+            lambda share: progress("", 0.5 * share / len(cameras)),
+            (backgrounds or {}).get(key, []),
+            others=others,
+            episode=index,
+            key=key,
+        )
     priors = {key: scene.provenance for key, scene in scenes.items()}
     new = []
     if recipe.include_source:
@@ -157,32 +163,47 @@ def reconstruct(
     recipe: Recipe,
     progress: Callable[[float], object] = lambda share: None,
     backgrounds: Sequence[SharedBackground] = (),
+    *,
+    others: Sequence[View] = (),
+    episode: int | None = None,
+    key: str | None = None,
 ) -> Reconstruction:
     """Priors, initial scene and fit of one camera's video; the first of the shared backgrounds that fits is used.
 
     Long videos are cut into windows, each with priors and a scene of its own, so that memory beyond the video itself
-    is that of one window. Windows share a background as episodes do.
+    is that of one window. Windows share a background as episodes do. The last arguments are those of
+    `estimate_priors`.
     """
     windows = _windows(view, recipe)
     if len(windows) > 1 and not backgrounds and recipe.scene.shared_background:
         some = [shrink(few_frames(window), recipe.fit.max_width) for _, window in windows]
         backgrounds = [_fitted(background, recipe) for background in share_backgrounds(some)]
+    beside = [[shrink(window, recipe.fit.max_width) for _, window in _windows(other, recipe)] for other in others]
     fitted = []
     for number, (_, window) in enumerate(windows):
 
         def within(share: float, done: int = number) -> object:
             return progress((done + share) / len(windows))
 
-        fitted.append(_fit_window(shrink(window, recipe.fit.max_width), recipe, within, backgrounds))
+        def priors_of(small: View, now: int = number) -> Priors:
+            here = [other[now] for other in beside]
+            return estimate_priors(
+                small, recipe.priors, recipe.camera, others=here, episode=episode, key=key, device=recipe.device
+            )
+
+        fitted.append(_fit_window(shrink(window, recipe.fit.max_width), recipe, within, backgrounds, priors_of))
     results, known, distances = zip(*fitted, strict=True)
     starts = tuple(start for start, _ in windows)
-    return Reconstruction(results, starts, known[0].metric, known[0].provenance, view.camera, distances[0])
+    camera = view.camera
+    if all(priors.camera is not None for priors in known):
+        camera = concatenated([priors.camera for priors in known]).resized(camera.width, camera.height)
+    return Reconstruction(results, starts, known[0].metric, known[0].provenance, camera, distances[0])
 
 
 def _windows(view: View, recipe: Recipe) -> list[tuple[int, View]]:
-    """First frames and parts of a video, of about equal length; depth from a file is for the whole video."""
+    """First frames and parts of a video, of about equal length; what is not estimated per frame needs it whole."""
     frames = len(view.rgb)
-    count = 1 if recipe.priors.depth not in DEPTH_PROVIDERS else -(-frames // recipe.fit.window_frames)
+    count = 1 if recipe.needs_whole_videos else -(-frames // recipe.fit.window_frames)
     bounds = [round(i * frames / count) for i in range(count + 1)]
     parts = []
     for start, end in itertools.pairwise(bounds):
@@ -192,13 +213,20 @@ def _windows(view: View, recipe: Recipe) -> list[tuple[int, View]]:
 
 
 def _fit_window(
-    view: View, recipe: Recipe, progress: Callable[[float], object], backgrounds: Sequence[SharedBackground]
+    view: View,
+    recipe: Recipe,
+    progress: Callable[[float], object],
+    backgrounds: Sequence[SharedBackground],
+    priors_of: Callable[[View], Priors],
 ) -> tuple[FitResult, Priors, float]:
     """A fitted scene of one window at the size at which it is fitted, its priors, and its look-at distance (m)."""
     steps, settings = recipe.fit.steps, recipe.scene
     with _one_torch_thread():
-        priors = estimate_priors(view, recipe.priors, recipe.camera)
-        if recipe.priors.depth not in DEPTH_PROVIDERS:
+        priors = priors_of(view)
+        view = replace(view, camera=priors.camera or view.camera)
+        if not view.camera.is_static:
+            logger.warning("the camera moves, but the empty scene is built as if it were fixed: expect blur")
+        if recipe.priors.depth.endswith(".npz"):
             priors = replace(priors, depth=sharpened(priors.depth))
             settings = _for_rough_depth(settings)
         empty = empty_scene(view.rgb, priors.depth, priors.instances)
@@ -277,17 +305,3 @@ def new_pictures(scene: Reconstruction, camera: CameraTrack, frames: Tensor | No
                 holes.append(share)
                 yield Picture(filled, np.where((alpha >= HOLE_ALPHA) & scene.metric, depth, np.float32(0)))
     logger.info("%.1f %% of the pixels were filled in (worst frame %.1f %%)", 100 * np.mean(holes), 100 * max(holes))
-
-
-def shrink(view: View, max_width: int) -> View:
-    """The same video with at most `max_width` columns; depth keeps its values (nearest pixel)."""
-    height, width = view.rgb.shape[1:3]
-    if width <= max_width:
-        return view
-    size = (max_width, round(height * max_width / width))
-    rgb = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in view.rgb.numpy()])
-    depth: Float[Tensor, "t h w"] | None = None
-    if view.depth is not None:
-        images = [cv2.resize(image, size, interpolation=cv2.INTER_NEAREST) for image in view.depth.numpy()]
-        depth = torch.from_numpy(np.stack(images))
-    return View(torch.from_numpy(rgb), resized(view.camera, *size), depth, view.depth_range)

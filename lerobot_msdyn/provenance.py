@@ -21,7 +21,9 @@ class Provenance:
     variant: int  # SOURCE_VARIANT for a copy of the source's episode
     seed: int
     perturbation: dict[str, dict[str, float]] = field(default_factory=dict)  # camera -> what was drawn
-    priors: dict[str, dict[str, str]] = field(default_factory=dict)  # camera -> prior -> provider and why
+    priors: dict[str, dict[str, dict[str, str]]] = field(
+        default_factory=dict
+    )  # camera -> prior -> provider, why, model
 
 
 def write_provenance(root: Path, episodes: list[Provenance], recipe_yaml: str) -> None:

@@ -1,7 +1,7 @@
 """Pictures of a dynamic scene: frames from a camera track."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -49,9 +49,3 @@ def render_frames(
     for start in range(0, len(frames), batch):
         part = slice(start, min(start + batch, len(frames)))
         yield draw(scene, camera.select(part), frames[part], backend)
-
-
-def resized(camera: CameraTrack, width: int, height: int) -> CameraTrack:
-    """The same camera with another number of pixels."""
-    scale = torch.tensor([[width / camera.width], [height / camera.height], [1.0]], device=camera.intrinsics.device)
-    return replace(camera, intrinsics=camera.intrinsics * scale, width=width, height=height)

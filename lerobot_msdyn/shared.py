@@ -14,8 +14,8 @@ from torch import Tensor
 from lerobot_msdyn.background import MARGIN_PX, EmptyScene, empty_scene
 from lerobot_msdyn.cameras import CameraTrack
 from lerobot_msdyn.episode import View
-from lerobot_msdyn.priors.change import changes
-from lerobot_msdyn.priors.depth import clean_recorded_depth
+from lerobot_msdyn.priors.change import Reference
+from lerobot_msdyn.priors.edges import clean_recorded_depth
 from lerobot_msdyn.priors.masks import temporal_median
 from lerobot_msdyn.scene import Gaussians, rgb_to_sh
 
@@ -164,7 +164,8 @@ def _pooled(views: list[View]) -> EmptyScene:
     """The empty scene over some frames of every video; what differs from the median of all of them moves."""
     rgb = torch.cat([view.rgb for view in views])
     median, noise = temporal_median(rgb)
-    moving = torch.from_numpy(changes(rgb.numpy(), median.numpy(), noise.numpy()).astype(np.uint8))
+    reference = Reference(median.numpy(), noise.numpy())
+    moving = torch.from_numpy(np.stack([reference.change(frame) > 0 for frame in rgb.numpy()]).astype(np.uint8))
     depths: list[Float[Tensor, "t h w"]] = []
     for view in views:
         unknown = torch.zeros(view.rgb.shape[:3])

@@ -43,3 +43,9 @@ def shared_data() -> Path:
     if not path.is_dir():
         pytest.skip("no recorded episodes beside the checkout")
     return path
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Priors are kept in a folder of the test run, not in the user's."""
+    os.environ["LEROBOT_MSDYN_CACHE"] = str(tmp_path_factory.mktemp("cache"))

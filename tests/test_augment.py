@@ -120,7 +120,7 @@ def test_bad_input_is_one_line_and_exit_code_2(desk: Path, tmp_path: Path, capsy
         ([*source, "--new_root", str(tmp_path / "there")], "exists already"),
         ([*source, "--recipe", str(recipe)], "unknown field 'variantz', did you mean 'variants'?"),
         ([*source, "--recipe", str(wrong)], "Couldn't parse 'many' into an int"),
-        ([*source, "--priors.depth", str(tmp_path / "no.npz")], "no readable `depth`"),
+        ([*source, "--priors.depth", str(tmp_path / "no.npz")], "not a readable npz file"),
         ([*source, "--device", "cuda"], "--device cpu"),
     ]
     for arguments, message in cases:

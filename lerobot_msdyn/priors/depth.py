@@ -1,4 +1,4 @@
-"""Depth without learned weights: cleaned sensor depth, or a table plane on which everything stands."""
+"""Depth without a sensor or learned weights: a table plane on which everything stands; and the empty scene's depth."""
 
 import math
 
@@ -7,39 +7,10 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-_SUPPORT = 0.03  # relative difference up to which two neighbouring depths count as one surface
-_MIN_SUPPORT = 3  # of the eight neighbours; a straight edge of a true surface has five, its corner three
 _WALL = 3.0  # distance of the wall behind the table, in distances to the table at the image's centre
 _LOWEST = 0.98  # quantile of an instance's rows where it touches the table; the very last ones may be stray pixels
 _SMOOTH_FRAMES = 9  # of the temporal smoothing of an instance's distance
 _STATIC_SAMPLES = 60  # frames over which a static median is taken
-_ALIGN_SAMPLES = 20_000  # pixels of a clip that an alignment looks at
-_ALIGN_STEPS = 20
-
-
-def clean_recorded_depth(depth: Float[Tensor, "t h w"], depth_min: float, depth_max: float) -> Float[Tensor, "t h w"]:
-    """Recorded z-depth (m) with everything that is no measurement set to 0.
-
-    LeRobot stores depth in a bounded range: a missing pixel comes back as `depth_min` and a far one as `depth_max`
-    (both up to rounding of the codec), so both ends are discarded. Flying pixels, between two surfaces, are found by
-    having fewer than three neighbours of their own depth.
-    """
-    inside = torch.isfinite(depth) & (depth > 1.5 * depth_min) & (depth < 0.99 * depth_max)
-    cleaned = torch.where(inside, depth, 0.0)
-    return torch.stack([torch.where(_is_supported(frame), frame, 0.0) for frame in cleaned])
-
-
-def _is_supported(depth: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
-    """Pixels with enough neighbours of their own depth; a neighbour outside the image counts as one."""
-    height, width = depth.shape
-    padded = torch.nn.functional.pad(depth[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
-    support = torch.zeros(height, width, dtype=torch.int8)
-    for y in range(3):
-        for x in range(3):
-            if (y, x) != (1, 1):
-                neighbour = padded[y : y + height, x : x + width]
-                support += (neighbour - depth).abs() < _SUPPORT * depth
-    return support >= _MIN_SUPPORT
 
 
 def table_plane_depth(
@@ -91,28 +62,3 @@ def static_depth(depth: Float[Tensor, "t h w"], instances: UInt8[Tensor, "t h w"
 def _static_median(depth: Float[Tensor, "t p"], instances: UInt8[Tensor, "t p"]) -> Float[Tensor, " p"]:
     usable = (instances == 0) & (depth > 0)
     return torch.where(usable, depth, torch.nan).nanmedian(dim=0).values.nan_to_num(0.0)
-
-
-def align_disparity(disparity: Float[Tensor, "t h w"], reference: Float[Tensor, "t h w"]) -> Float[Tensor, "t h w"]:
-    """Depth (m) of relative inverse depth, by one robust scale and shift per clip against a reference depth (m).
-
-    Least absolute differences of inverse depth, by iterated reweighting. Depth is bounded by twice the reference's
-    largest, which also takes care of inverse depths that come out negative. Where the two disagree so much that
-    the scale would not be positive, the disparity is of no use and the reference is returned.
-    """
-    usable = (reference > 0) & torch.isfinite(disparity)
-    x, y = disparity[usable].double(), reference[usable].double().reciprocal()
-    if len(x) == 0:
-        return reference
-    stride = max(1, len(x) // _ALIGN_SAMPLES)
-    x, y = x[::stride], y[::stride]
-    design = torch.stack((x, torch.ones_like(x)), dim=1)
-    weights = torch.ones_like(x)
-    for _ in range(_ALIGN_STEPS):
-        root = weights.sqrt()[:, None]
-        scale, shift = torch.linalg.lstsq(design * root, y[:, None] * root).solution[:, 0].tolist()
-        weights = (design @ torch.tensor([scale, shift], dtype=x.dtype) - y).abs().clamp(min=1e-4).reciprocal()
-    if scale <= 0:
-        return reference
-    inverse = (scale * disparity + shift).clamp(min=0.5 / float(reference.max()))
-    return torch.where(torch.isfinite(disparity), inverse.reciprocal(), 0.0)

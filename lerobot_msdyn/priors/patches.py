@@ -44,14 +44,14 @@ class Patches:
 
     def _look(self, grey: Float32[ndarray, "h w"], xy: Float32[ndarray, "n 2"]) -> Float32[ndarray, "n p"]:
         values = _values(grey, xy)
-        total = self.weights.sum(1, keepdims=True)
-        return values - (self.weights * values).sum(1, keepdims=True) / total
+        return values - (_dot(self.weights, values) / self.weights.sum(1))[:, None]
 
     def _compare(self, found: Float32[ndarray, "n p"]) -> tuple[Float32[ndarray, " n"], Float32[ndarray, " n"]]:
         """Correlation with other patches less their means, and the other's contrast relative to this one's."""
         total = self.weights.sum(1)
-        covariance = (self.weights * self.values * found).sum(1) / total + _NOISE_VARIANCE
-        energy = (self.weights * found * found).sum(1) / total + _NOISE_VARIANCE
+        weighted = self.weights * found
+        covariance = _dot(weighted, self.values) / total + _NOISE_VARIANCE
+        energy = _dot(weighted, found) / total + _NOISE_VARIANCE
         own = self.energy + _NOISE_VARIANCE
         return covariance / np.sqrt(energy * own), np.sqrt(energy / own)
 
@@ -81,19 +81,24 @@ def register(
     """
     prior = _NOISE_VARIANCE / _FLOW_STD_PX**2
     weighted = patches.weights[..., None] * patches.gradients
-    hessian = np.einsum("npi,npj->nij", weighted, patches.gradients) + prior * np.eye(2, dtype=np.float32)
+    across = np.ascontiguousarray(weighted.transpose(0, 2, 1))
+    hessian = across @ patches.gradients + prior * np.eye(2, dtype=np.float32)
     inverse = np.linalg.inv(hessian)
     xy = start.copy()
     for _ in range(_ITERATIONS):
         found = patches._look(grey, xy)
         gain = patches._compare(found)[1].clip(*_GAIN)[:, None]
-        error = np.einsum("npi,np->ni", weighted, found / gain - patches.values) + prior * (xy - start)
-        xy = xy - np.einsum("nij,nj->ni", inverse, error)
+        error = (across @ (found / gain - patches.values)[..., None])[..., 0] + prior * (xy - start)
+        xy = xy - (inverse @ error[..., None])[..., 0]
     moved = np.linalg.norm(xy - start, axis=1)
     xy = np.where((moved < _MAX_MOVE_PX)[:, None], xy, start)
     before, after = patches.correlation(grey, start), patches.correlation(grey, xy)
     better = after >= before
     return np.where(better[:, None], xy, start), np.where(better, after, before)
+
+
+def _dot(a: Float32[ndarray, "n p"], b: Float32[ndarray, "n p"]) -> Float32[ndarray, " n"]:
+    return np.einsum("np,np->n", a, b)
 
 
 def sample(image: ndarray, xy: Float32[ndarray, "n 2"]) -> Float32[ndarray, "n c"]:

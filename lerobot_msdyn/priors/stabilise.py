@@ -57,9 +57,7 @@ def to_frames(images: Shaped[ndarray, "t h w *c"], sway: Float32[ndarray, "t 2 3
 
 def _warped(images: ndarray, sway: Float32[ndarray, "t 2 3"], flags: int) -> ndarray:
     size = (images.shape[2], images.shape[1])
-    return np.stack(
-        [
-            cv2.warpAffine(image, affine, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-            for image, affine in zip(images, sway, strict=True)
-        ]
-    )
+    out = np.empty_like(images)
+    for i, affine in enumerate(sway):
+        out[i] = cv2.warpAffine(images[i], affine, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    return out

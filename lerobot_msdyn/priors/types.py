@@ -1,9 +1,38 @@
-"""What the priors hand to the reconstruction: depth, instances and point tracks of one camera's video."""
+"""What the priors hand to the reconstruction: depth, instances, point tracks and the camera of one video."""
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
+
+from lerobot_msdyn.cameras import CameraTrack
+from lerobot_msdyn.priors.hub import LocalModel
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Which provider a prior comes from, and why that one."""
+
+    provider: str
+    why: str
+    model: str = ""  # empty where nothing learned is involved
+    revision: str = ""
+    licence: str = ""
+
+    @classmethod
+    def learned(cls, provider: str, model: LocalModel, why: str) -> "Origin":
+        """That of a learned model."""
+        return cls(provider, why, model.name, model.revision, model.licence)
+
+    @property
+    def line(self) -> str:
+        """For the log."""
+        model = f" ({self.model}, revision {self.revision}, {self.licence})" if self.model else ""
+        return f"{self.provider}{model}: {self.why}"
+
+    def entry(self) -> dict[str, str]:
+        """For files: what is known, by name."""
+        return {name: value for name, value in asdict(self).items() if value}
 
 
 @dataclass(frozen=True)
@@ -28,4 +57,5 @@ class Priors:
     empty: UInt8[Tensor, "h w 3"]  # colours of the scene without what moves
     tracks: PointTracks
     metric: bool  # whether depth is in true metres (a sensor or a calibration) or only plausible
-    provenance: dict[str, str] = field(default_factory=dict)  # prior -> one line: which provider, and why
+    provenance: dict[str, dict[str, str]] = field(default_factory=dict)  # prior -> provider, why, model, licence
+    camera: CameraTrack | None = None  # the one to use from here on; None: that of the video

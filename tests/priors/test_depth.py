@@ -1,41 +1,13 @@
-"""Depth: cleaning, the table plane, the empty scene, alignment."""
+"""Depth: the table plane, the empty scene."""
 
 import math
 
 import pytest
 import torch
 
-from lerobot_msdyn.priors.depth import align_disparity, clean_recorded_depth, static_depth, table_plane_depth
+from lerobot_msdyn.priors.depth import static_depth, table_plane_depth
 
 K = torch.tensor([[50.0, 0.0, 32.0], [0.0, 50.0, 24.0], [0.0, 0.0, 1.0]])
-
-
-def test_both_ends_of_the_recorded_range_are_unknown() -> None:
-    depth = torch.full((1, 6, 6), 1.0)
-    depth[0, :3, :3] = 0.0101  # LeRobot's missing pixel, after its codec
-    depth[0, 3:, 3:] = 9.99  # and its "farther than the range"
-    cleaned = clean_recorded_depth(depth, 0.01, 10.0)
-    assert (cleaned[0, :3, :3] == 0).all()
-    assert (cleaned[0, 3:, 3:] == 0).all()
-    assert (cleaned[0, :3, 3:] == 1).all()
-
-
-def test_a_range_without_ends_keeps_everything_that_is_a_number() -> None:
-    depth = torch.full((1, 5, 5), 3.0)
-    depth[0, 2, 2] = torch.inf
-    depth[0, 0, 0] = torch.nan
-    cleaned = clean_recorded_depth(depth, 0.0, math.inf)
-    assert (cleaned == 0).sum() == 2
-    assert cleaned[0, 4, 4] == 3
-
-
-def test_flying_pixels_go_and_true_edges_stay() -> None:
-    depth = torch.full((1, 8, 8), 1.0)
-    depth[:, :, 4:] = 2.0
-    expected = depth.clone()
-    depth[0, 3, 4] = 1.5  # hangs between the two surfaces
-    expected[0, 3, 4] = 0
-    torch.testing.assert_close(clean_recorded_depth(depth, 0.0, math.inf), expected)
 
 
 def test_the_table_is_where_trigonometry_puts_it() -> None:
@@ -78,25 +50,3 @@ def test_a_pixel_that_the_sample_misses_is_looked_up_in_all_frames() -> None:
     depth = torch.full((200, 2, 2), 1.0)
     depth[101] = 4.0
     torch.testing.assert_close(static_depth(depth, instances), torch.full((2, 2), 4.0))
-
-
-def test_disparity_is_aligned_in_spite_of_outliers() -> None:
-    generator = torch.Generator().manual_seed(0)
-    truth = 0.5 + 2 * torch.rand(3, 20, 20, generator=generator)
-    disparity = 7 / truth - 1.5
-    reference = truth.clone()
-    reference[:, :6] = 3.0  # 30 % of the reference is wrong
-    torch.testing.assert_close(align_disparity(disparity, reference), truth, atol=1e-3, rtol=0)
-
-
-def test_a_disparity_that_runs_the_wrong_way_is_refused() -> None:
-    reference = 1 + torch.rand(2, 8, 8, generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(align_disparity(-1 / reference, reference), reference)
-
-
-def test_far_disparity_stays_bounded() -> None:
-    reference = 1 + torch.rand(2, 8, 8, generator=torch.Generator().manual_seed(0))
-    disparity = 1 / reference
-    disparity[0, 0, 0] = -3.0
-    aligned = align_disparity(disparity, reference)
-    assert aligned[0, 0, 0].item() == pytest.approx(2 * reference.max().item())

@@ -57,3 +57,16 @@ def test_a_still_video_has_no_instances(sliding) -> None:
     rgb = sliding.rgb[:1].expand(8, -1, -1, -1).contiguous()
     median, noise = temporal_median(rgb)
     assert not moving_instances(rgb, median, noise).any()
+
+
+def test_another_episode_shows_what_this_one_hides(sliding) -> None:
+    """The block never leaves its place by more than its own width; in another episode it is not there."""
+    rgb = sliding.rgb[:8]
+    median, _ = temporal_median(rgb)
+    bare = torch.from_numpy(sliding.empty.round().astype(np.uint8)).expand(12, -1, -1, -1)
+    better, noise = temporal_median(rgb, bare)
+    inside = sliding.mask[0]
+    assert np.abs(better.numpy().astype(float) - sliding.empty).mean(-1)[inside].mean() < 4
+    assert np.abs(median.numpy().astype(float) - sliding.empty).mean(-1)[inside].mean() > 20
+    instances = moving_instances(rgb, better, noise, bare)
+    assert overlap(instances[4] > 0, sliding.mask[4]) > 0.75

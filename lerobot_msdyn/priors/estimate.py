@@ -1,0 +1,61 @@
+"""Priors of one camera's video, by the configured providers."""
+
+import logging
+from collections.abc import Sequence
+
+from lerobot_msdyn.config import CameraConfig, PriorsConfig
+from lerobot_msdyn.episode import View
+from lerobot_msdyn.priors.cache import open_cache
+from lerobot_msdyn.priors.hub import torch_device
+from lerobot_msdyn.priors.masks import empty_scene, temporal_median
+from lerobot_msdyn.priors.provide_cameras import provide_camera, with_searched_fov
+from lerobot_msdyn.priors.provide_depth import provide_depth
+from lerobot_msdyn.priors.provide_masks import provide_masks
+from lerobot_msdyn.priors.provide_tracks import provide_tracks
+from lerobot_msdyn.priors.request import Request
+from lerobot_msdyn.priors.types import Priors
+
+logger = logging.getLogger(__name__)
+
+
+def estimate_priors(
+    view: View,
+    config: PriorsConfig,
+    camera: CameraConfig,
+    *,
+    others: Sequence[View] = (),
+    episode: int | None = None,
+    key: str | None = None,
+    device: str = "auto",
+) -> Priors:
+    """Run the providers that the recipe asks for on one camera's video.
+
+    Args:
+        view: the video.
+        config: the providers.
+        camera: what is assumed about the camera.
+        others: videos of the same moments by other cameras, for stereo.
+        episode: index of the episode, by which exchange files are found and checked.
+        key: feature key of the camera, likewise.
+        device: auto, cpu or cuda, for learned providers.
+
+    Raises:
+        PriorError: a provider was asked for by name and cannot be had, or an exchange file cannot be used.
+    """
+    request = Request(
+        view, config, camera, open_cache(config.cache, view.rgb), others, episode, key, torch_device(device)
+    )
+    instances, masks_from = provide_masks(request)
+    request, camera_from = provide_camera(request, instances)
+    (depth, metric), depth_from = provide_depth(request, instances)
+    tracks, tracks_from = provide_tracks(request, instances)
+    pinhole = request.view.camera
+    if camera.fov_search:
+        pinhole, camera_from = with_searched_fov(pinhole, tracks, depth, depth_from.provider)
+    empty = empty_scene(view.rgb, instances, temporal_median(view.rgb)[0])
+    origins = {"camera": camera_from, "masks": masks_from, "depth": depth_from, "tracks": tracks_from}
+    found = {"masks": f", {int(instances.max())} instances", "tracks": f", {len(tracks)} tracks"}
+    for prior, origin in origins.items():
+        logger.info("%s: %s%s", prior, origin.line, found.get(prior, ""))
+    provenance = {prior: origin.entry() for prior, origin in origins.items()}
+    return Priors(depth, instances, empty, tracks, metric, provenance, pinhole)

@@ -1,0 +1,85 @@
+"""Models on this machine: where they are looked for, and what is said when they are absent."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from huggingface_hub import constants
+
+from lerobot_msdyn.config import PriorsConfig
+from lerobot_msdyn.errors import PriorError
+from lerobot_msdyn.priors.hub import (
+    LICENCES,
+    NON_COMMERCIAL,
+    demand_library,
+    demand_model,
+    find_model,
+    has_library,
+    torch_device,
+)
+
+SAM2 = "facebook/sam2.1-hiera-tiny"
+
+
+def put_in_cache(home: Path, name: str, weights: bool = True) -> None:
+    """As `hf download` leaves a model."""
+    folder = home / f"models--{name.replace('/', '--')}"
+    snapshot = folder / "snapshots" / "0123abcd"
+    snapshot.mkdir(parents=True)
+    (folder / "refs").mkdir()
+    (folder / "refs" / "main").write_text("0123abcd")
+    (snapshot / "config.json").write_text("{}")
+    if weights:
+        (snapshot / "model.safetensors").write_bytes(b"")
+
+
+@pytest.fixture
+def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
+    return tmp_path
+
+
+def test_a_cached_model_comes_with_its_revision_and_licence(hub: Path) -> None:
+    assert find_model(SAM2) is None
+    put_in_cache(hub, SAM2)
+    model = find_model(SAM2)
+    assert model is not None
+    assert (model.revision, model.licence) == ("0123abcd", "Apache-2.0")
+    assert (model.folder / "config.json").is_file()
+
+
+def test_a_model_without_weights_does_not_count(hub: Path) -> None:
+    put_in_cache(hub, SAM2, weights=False)
+    assert find_model(SAM2) is None
+
+
+def test_a_missing_model_is_named_with_the_command_that_fetches_it(hub: Path) -> None:
+    with pytest.raises(PriorError, match=f"priors.masks is 'sam2'.*fetch it with: hf download {SAM2}$"):
+        demand_model(SAM2, "priors.masks", "sam2")
+
+
+@pytest.mark.parametrize("name", ["no such thing", "/absent/folder", "a/b/c", ""])
+def test_names_that_cannot_be_ids_are_not_found(hub: Path, name: str) -> None:
+    assert find_model(name) is None
+
+
+def test_a_missing_library_is_named_with_the_command_that_installs_it() -> None:
+    assert has_library("torch")
+    with pytest.raises(PriorError, match=r"needs no_such_library; install it with: pip install 'lerobot_msdyn\[sfm\]'"):
+        demand_library("no_such_library", "sfm", "camera.poses", "sfm")
+
+
+def test_no_default_is_restricted_to_non_commercial_use() -> None:
+    config = PriorsConfig()
+    defaults = [getattr(config, name) for name in vars(config) if name.endswith("_model")]
+    assert len(defaults) == 4
+    assert all(LICENCES[name] != NON_COMMERCIAL for name in defaults)
+
+
+def test_devices(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert [torch_device(name) for name in ("auto", "cpu")] == ["cpu", "cpu"]
+    with pytest.raises(PriorError, match="no CUDA device is there"):
+        torch_device("cuda")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert [torch_device(name) for name in ("auto", "cpu", "cuda")] == ["cuda", "cpu", "cuda"]

@@ -1,0 +1,169 @@
+"""Which provider is chosen, why, and what it hands on; whole clips with small made-up models."""
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from huggingface_hub import constants
+
+from lerobot_msdyn.cameras import intrinsics_from_fov, static_camera
+from lerobot_msdyn.config import CameraConfig, PriorsConfig
+from lerobot_msdyn.episode import View
+from lerobot_msdyn.errors import PriorError
+from lerobot_msdyn.priors import Priors, estimate_priors
+
+FRAMES = 12
+
+
+@pytest.fixture(autouse=True)
+def nothing_cached(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine without learned models."""
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path_factory.mktemp("hub")))
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path_factory.mktemp("torch")))
+
+
+@pytest.fixture(scope="module")
+def view(sliding) -> View:
+    """A block that slides before a wall two metres away, itself one metre away; with recorded depth."""
+    rgb, mask = sliding.rgb[6 : 6 + FRAMES], sliding.mask[6 : 6 + FRAMES]
+    depth = torch.where(mask, 1.0, 2.0)
+    return View(rgb, static_camera(intrinsics_from_fov(96, 72, 60.0), FRAMES, 96, 72), depth, (0.01, 10.0))
+
+
+def estimate(view: View, camera: CameraConfig | None = None, **config: object) -> Priors:
+    return estimate_priors(view, PriorsConfig(**config), camera or CameraConfig(), episode=0, key="front")  # type: ignore[arg-type]
+
+
+def test_auto_takes_what_is_at_hand_and_says_why(view: View, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO):
+        priors = estimate(view)
+    said = {record.message.split(":")[0]: record.message for record in caplog.records}
+    assert "recorded: the dataset has it" in said["depth"]
+    assert "change: no learned model is on this machine, 1 instances" in said["masks"]
+    assert "flow: RAFT's weights are not on this machine" in said["tracks"]
+    assert "fixed: the picture keeps still" in said["camera"]
+    assert all("\n" not in line for line in said.values())
+    assert priors.metric
+    assert {prior: entry["provider"] for prior, entry in priors.provenance.items()} == {
+        "camera": "fixed",
+        "masks": "change",
+        "depth": "recorded",
+        "tracks": "flow",
+    }
+    plane = estimate(replace(view, depth=None))
+    assert not plane.metric
+    assert plane.provenance["depth"]["provider"] == "plane"
+    assert "no depth is recorded, no learned model is on this machine" in plane.provenance["depth"]["why"]
+
+
+def test_a_second_run_reads_what_the_first_has_kept(view: View, tmp_path: Path, caplog) -> None:
+    first = estimate(view, cache=str(tmp_path))
+    with caplog.at_level(logging.INFO):
+        second = estimate(view, cache=str(tmp_path))
+    assert sum("taken from" in record.message for record in caplog.records) == 2
+    assert torch.equal(first.instances, second.instances)
+    assert torch.equal(first.tracks.xy, second.tracks.xy)
+
+
+def test_depth_that_holds_nothing_is_named_and_auto_goes_on(view: View, caplog: pytest.LogCaptureFixture) -> None:
+    assert view.depth is not None
+    empty = replace(view, depth=torch.zeros_like(view.depth))
+    with pytest.raises(PriorError, match="recorded depth of front holds no measurement in any of its 12 frames"):
+        estimate(empty, depth="recorded")
+    with caplog.at_level(logging.WARNING):
+        priors = estimate(empty)
+    assert priors.provenance["depth"]["provider"] == "plane"
+    assert "recorded cannot be used" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"depth": "depth_anything"}, "hf download depth-anything/Depth-Anything-V2-Small-hf$"),
+        ({"depth": "depth_anything_metric"}, "hf download depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf$"),
+        ({"masks": "sam2"}, "hf download facebook/sam2.1-hiera-tiny$"),
+        ({"masks": "edgetam"}, "hf download yonigozlan/EdgeTAM-hf$"),
+        ({"tracks": "raft"}, "weights are not on this machine; fetch: python -c"),
+        ({"depth": "stereo"}, "no second camera with K, R and t"),
+        ({"depth": "absent.npz"}, "absent.npz: not a readable npz file"),
+    ],
+)
+def test_what_was_asked_for_and_is_absent_is_named(view: View, config: dict[str, str], message: str) -> None:
+    with pytest.raises(PriorError, match=message):
+        estimate(view, **config)
+
+
+def test_recorded_depth_must_be_there(view: View) -> None:
+    with pytest.raises(PriorError, match="no <camera>_depth feature"):
+        estimate(replace(view, depth=None), depth="recorded")
+
+
+def exchange(path: Path, **arrays: object) -> str:
+    np.savez(path, **{name: np.asarray(value) for name, value in arrays.items()})  # type: ignore[arg-type]
+    return str(path)
+
+
+def test_everything_from_an_exchange_file(view: View, tmp_path: Path) -> None:
+    masks = np.zeros((FRAMES, 72, 96), np.uint8)
+    masks[:, 20:40, 10:30] = 1
+    xy = np.full((3, FRAMES, 2), 25.0, np.float32)
+    xy[1], xy[2] = 90.0, -5.0  # on the background, and outside
+    assert view.depth is not None
+    file = exchange(
+        tmp_path / "front_0.npz",
+        masks=masks,
+        depth=4 / view.depth.numpy() + 1,
+        depth_kind="affine_disparity",
+        tracks=xy,
+        vis=np.ones((3, FRAMES), bool),
+        K=np.array([[80.0, 0, 48], [0, 80, 36], [0, 0, 1]]),
+        w2c=np.tile(np.eye(4), (FRAMES, 1, 1)),
+        provenance='{"depth": {"model": "some/model", "licence": "MIT"}}',
+    ).replace("front_0", "{camera}_{episode}")
+    priors = estimate(view, CameraConfig(poses=file), depth=file, masks=file, tracks=file)
+    assert torch.equal(priors.instances, torch.from_numpy(masks))
+    assert len(priors.tracks) == 1
+    assert priors.camera is not None
+    assert (float(priors.camera.intrinsics[0, 0, 0]), priors.camera.origin) == (80.0, "exchange")
+    assert priors.provenance["depth"]["model"] == "some/model"
+    assert "scaled and shifted to recorded" in priors.provenance["depth"]["why"]
+    known = priors.depth > 0
+    torch.testing.assert_close(priors.depth[known], view.depth[known], atol=1e-2, rtol=0)
+    assert known.float().mean() > 0.9
+
+
+def test_what_a_file_lacks_is_named(view: View, tmp_path: Path) -> None:
+    file = exchange(tmp_path / "x.npz", frames=FRAMES)
+    for prior in ("depth", "masks", "tracks"):
+        with pytest.raises(PriorError, match=rf"priors.{prior}: .*x\.npz has no array"):
+            estimate(view, **{prior: file})
+    with pytest.raises(PriorError, match="has neither K nor w2c"):
+        estimate(view, CameraConfig(poses=file))
+
+
+def test_learned_models_are_used_where_they_are_and_recorded(view: View, tmp_path: Path) -> None:
+    pytest.importorskip("transformers")
+    from tiny_models import save_depth_anything, save_sam2
+
+    relative, metric, sam2 = (str(tmp_path / name) for name in ("relative", "metric", "sam2"))
+    save_depth_anything(Path(metric), "metric")
+    save_sam2(Path(sam2))
+    priors = estimate(replace(view, depth=None), depth_anything_metric_model=metric, sam2_model=sam2)
+    depth, masks = priors.provenance["depth"], priors.provenance["masks"]
+    assert (depth["provider"], depth["model"], depth["revision"]) == ("depth_anything_metric", metric, "local")
+    assert "in the network's own metres" in depth["why"]
+    assert (masks["provider"], masks["model"], masks["licence"]) == ("sam2", sam2, "unknown: read its model card")
+    scaled = estimate(view, depth="depth_anything_metric", depth_anything_metric_model=metric)
+    assert "scaled to recorded" in scaled.provenance["depth"]["why"]
+    assert scaled.metric
+    with pytest.raises(PriorError, match="predicts metric"):
+        estimate(view, depth="depth_anything", depth_anything_model=metric)
+    assert not Path(relative).exists()
+
+
+def test_the_field_of_view_is_not_searched_on_a_plane(view: View) -> None:
+    with pytest.raises(PriorError, match="needs depth that does not depend on the field of view"):
+        estimate(view, CameraConfig(fov_search=True), depth="plane")
