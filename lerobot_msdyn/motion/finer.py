@@ -29,10 +29,12 @@ _LEAST_GRAIN = 12  # tracks of a grain
 _FOLDS = 3  # each third of the tracks judges a level that was fitted to the others
 _LEAST_JUDGES = 8  # tracks, without which a level is refused
 _CANONICAL_REACH = 4  # frames about the canonical one that do not judge
-_QUERY_FRAMES = 8  # spread over the clip, from which held-out tracks are predicted ...
-_QUERY_REACH = 4  # ... in frames farther away than this
-_WORTH = 0.01  # of the error, that a level must take away ...
-_SURE = 3.0  # ... and standard errors that the gain must be: some ten pairs of part and level are judged per episode
+_QUERY_FRAMES = 4  # spread over the clip, from which judges are predicted ...
+_QUERY_REACH = 4  # ... in frames farther away than this ...
+_JUDGED_FRAMES = 60  # ... of so many
+_TRIM = 0.1  # of the judges at either end do not count: tracks that slipped, or are in a wrong part
+_VISIBLE_PX = 0.3  # that a level must explain: less is not seen, and the drift of the tracks themselves
+_SURE = 3.0  # standard errors that the gain must be: some ten pairs of part and level are judged per episode
 
 
 def add_level(
@@ -46,8 +48,8 @@ def add_level(
     """The next level, and the tracks as it leaves them.
 
     Each third of the tracks judges a level that was fitted to the others (cross-validation). They choose how much each
-    basis is smoothed over time, and, with `config.gate`, in which parts the level is kept: where it predicts them
-    better by 1 % and by three standard errors; elsewhere its bases are inactive.
+    basis is smoothed over time, and, with `config.gate`, in which parts the level is kept: where it explains
+    a visible motion of theirs, and surely so (`_proven`); elsewhere its bases are inactive.
     """
     names, levels, canonical = (*so_far.names, name), so_far.levels, so_far.canonical_frame
     owner, parents = _cluster(name, tracks, config, noise)
@@ -81,7 +83,7 @@ def add_level(
             judged = _prediction(level(trial, smoothing), name, fold == k, tracks, seen, so_far)
             error[fold == k], gain[fold == k] = judged
         kept = torch.zeros(len(found), dtype=torch.bool)
-        kept[owner[_proven(error, gain, tracks.part)[tracks.part]]] = True
+        kept[owner[_proven(error, gain, tracks.part, _VISIBLE_PX * seen.pixel_m)[tracks.part]]] = True
         found = replace(found, active=found.active & kept)
     return found, replace(tracks, positions=pull_back(found, indices, logits, tracks.positions), owner=owner)
 
@@ -165,26 +167,34 @@ def _prediction(
     without = replace(so_far, points=tracks.points[rest], part=tracks.part[rest], instance=seen.instance[rest])
     with_level = replace(without, names=(*so_far.names, name), levels=(*so_far.levels, level))
     rows = judges.nonzero()[:, 0]
-    times = torch.arange(seen.valid.shape[1])
+    frames = seen.valid.shape[1]
+    times = torch.arange(0, frames, -(-frames // _JUDGED_FRAMES))
     without_it, with_it, count = torch.zeros(3, len(rows))
-    for frame in torch.linspace(0, len(times) - 1, _QUERY_FRAMES).round().long().unique().tolist():
+    for frame in torch.linspace(0, frames - 1, _QUERY_FRAMES).round().long().unique().tolist():
         here = (tracks.weights[rows, frame] > 0).nonzero()[:, 0]
         who = rows[here]
-        weights = tracks.weights[who] * ((times - frame).abs() > _QUERY_REACH)
+        weights = tracks.weights[who][:, times] * ((times - frame).abs() > _QUERY_REACH)
         for motion, total in ((without, without_it), (with_level, with_it)):
             points, part = motion.to_canonical(seen.xyz[who, frame], frame, seen.instance[who])
             moved, _ = motion.moved(points, part, times)
-            total[here] += _root_mean_square(moved.transpose(0, 1) - seen.xyz[who], weights)
+            total[here] += _root_mean_square(moved.transpose(0, 1) - seen.xyz[who][:, times], weights)
         count[here] += 1
     return without_it / count, (without_it - with_it) / count
 
 
-def _proven(error: Float[Tensor, " n"], gain: Float[Tensor, " n"], part: Int[Tensor, " n"]) -> Bool[Tensor, " p"]:
-    """Parts whose tracks gain surely, and enough to matter."""
+def _proven(
+    error: Float[Tensor, " n"], gain: Float[Tensor, " n"], part: Int[Tensor, " n"], visible_m: float
+) -> Bool[Tensor, " p"]:
+    """Parts in which a level explains a visible motion, surely, and of more than a few tracks."""
     proven = torch.zeros(int(part.max()) + 1 if len(part) else 0, dtype=torch.bool)
     for label in part.unique().tolist():
-        judges = (part == label) & gain.isfinite()
-        gains, least = gain[judges], _WORTH * error[judges].mean()
-        if len(gains) >= _LEAST_JUDGES:
-            proven[label] = bool(gains.mean() > torch.maximum(_SURE * gains.std() / len(gains) ** 0.5, least))
+        judges = ((part == label) & gain.isfinite()).nonzero()[:, 0]
+        if len(judges) < _LEAST_JUDGES:
+            continue
+        trimmed = int(_TRIM * len(judges))
+        judges = judges[gain[judges].argsort()[trimmed : len(judges) - trimmed]]
+        before, gains = error[judges], gain[judges]
+        explained = (before.square() - (before - gains).square()).mean()
+        sure = gains.mean() > _SURE * gains.std() / len(gains) ** 0.5
+        proven[label] = bool(sure & (explained > visible_m**2))
     return proven
