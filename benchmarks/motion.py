@@ -1,7 +1,7 @@
 """Times the composition of motion levels, and measures how well levels explain known motions.
 
     OMP_WAIT_POLICY=passive python benchmarks/motion.py [--quick] [--json FILE]
-    ... benchmarks/motion.py --sim FOLDER [--scenes rigid_push,pick_place] [--noise_px 1] [--gate both] [--only sim]
+    ... benchmarks/motion.py --sim FOLDER [--scenes rigid_push,pick_place] [--noise_px 1] [--seed 0] [--gate on]
 
 * `time`: forward and backward of `compose` for a scene of 3 objects, 15 primitives and 150 grains, bound as Gaussians
   are. `dense` is the same call where every Gaussian names all bases of each level, `matrix` the same again with the
@@ -92,7 +92,10 @@ def make_load(gaussians: int, times: int, scale: int = 1, *, dense: bool = False
     if dense:
         pairs = [_all_bases(*each) for each in zip(indices, logits, map(len, levels), strict=True)]
         indices, logits = zip(*pairs, strict=True)
-    incoming = (torch.randn(times, gaussians, 3, generator=generator), torch.randn(times, gaussians, 4))
+    incoming = (
+        torch.randn(times, gaussians, 3, generator=generator),
+        torch.randn(times, gaussians, 4, generator=generator),
+    )
     frames = torch.linspace(0, FRAMES - 1, times)
     learned = [
         replace(level, **{name: getattr(level, name).requires_grad_() for name in ("rotations_6d", "displacements")})
@@ -214,10 +217,12 @@ def sim_errors(motion: SceneMotion, episode: Simulated) -> Tensor:
     return errors
 
 
-def sim_scene(folder: Path, tracks: int, noise_px: float, gate: str, variants: list[MotionConfig]) -> Iterator[dict]:
+def sim_scene(
+    folder: Path, tracks: int, noise_px: float, seed: int, gate: str, variants: list[MotionConfig]
+) -> Iterator[dict]:
     """Errors of one simulated episode."""
     episode = read_simulated(folder)
-    seen = observed(dense_tracks(episode, tracks), noise_px, DROPPED)
+    seen = observed(dense_tracks(episode, tracks, seed), noise_px, DROPPED, seed)
     instance = instance_of(episode.body)
     for variant in variants:
         for setting in gates(variant.levels, gate):
@@ -227,7 +232,7 @@ def sim_scene(folder: Path, tracks: int, noise_px: float, gate: str, variants: l
             seconds = time.perf_counter() - start
             assert motion is not None
             errors = sim_errors(motion, episode)
-            row = {"scene": folder.name, "noise_px": noise_px, **described(config, motion)}
+            row = {"scene": folder.name, "noise_px": noise_px, "seed": seed, **described(config, motion)}
             groups = (("", instance > 0), ("robot_", instance == ROBOT), ("object_", instance == OBJECT))
             for name, members in groups:
                 if members.any():
@@ -255,6 +260,7 @@ def parse(words: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--sim", type=Path, help="folder of simulated episodes")
     parser.add_argument("--scenes", default=SCENES, help="of that folder")
     parser.add_argument("--noise_px", type=float, default=1.0, help="of the simulated tracks")
+    parser.add_argument("--seed", type=int, default=0, help="of the points, noise and gaps of the simulated tracks")
     parser.add_argument("--json", type=Path, help="write the figures there")
     parser.add_argument("--quick", action="store_true", help="few Gaussians, tracks and rounds: does it run?")
     return parser.parse_args(words)
@@ -279,7 +285,8 @@ def main(words: list[str] | None = None) -> None:
         tracks, variants = (400, hierarchies[:1]) if quick else (4000, hierarchies)
         report["sim"] = []
         for scene in arguments.scenes.split(","):
-            rows = sim_scene(arguments.sim / scene, tracks, arguments.noise_px, arguments.gate or "on", variants)
+            folder, options = arguments.sim / scene, (arguments.noise_px, arguments.seed, arguments.gate or "on")
+            rows = sim_scene(folder, tracks, *options, variants)
             report["sim"] += printed(scene, rows)
     if arguments.json:
         arguments.json.write_text(json.dumps(report, indent=1) + "\n")
