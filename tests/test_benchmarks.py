@@ -1,0 +1,79 @@
+"""The benchmark of motion: its short run, and what its figures rest on."""
+
+import importlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+
+from lerobot_msdyn.geometry import axis_angle_to_matrix, se3
+from lerobot_msdyn.motion.compose import compose
+
+BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
+
+
+@pytest.fixture
+def benchmark(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+    """The module, which sets the number of threads."""
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    threads = torch.get_num_threads()
+    yield importlib.import_module("motion")
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture
+def simulated(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    return importlib.import_module("simulated")
+
+
+def test_the_short_run_writes_its_figures(benchmark: ModuleType, tmp_path: Path) -> None:
+    report = tmp_path / "report.json"
+    benchmark.main(["--quick", "--gate", "on", "--json", str(report)])
+    content = json.loads(report.read_text())
+    assert all(row["sparse_ms"] > 0 and row["dense_ratio"] > 0 for row in content["time"])
+    assert [row["scale"] for row in content["growth"]].count(1) == 5
+    assert {(row["scene"], *row["levels"]) for row in content["errors"]} == {
+        (scene, *levels)
+        for scene in ("rigid", "weak", "deformable")
+        for levels in (("object",), ("object", "primitive"))
+    }
+    assert all(0 < row["error_mm"] < 20 and row["gate"] for row in content["errors"])
+
+
+def test_all_routes_give_the_same(benchmark: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    sparse = compose(*benchmark.make_load(40, 3).arguments)
+    dense = benchmark.make_load(40, 3, dense=True)
+    for by_matrix in (False, True):
+        if by_matrix:
+            monkeypatch.setattr(benchmark.bases, "blend", benchmark.blend_by_matrix)
+        for one, other in zip(sparse, compose(*dense.arguments), strict=True):
+            torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-4)
+        dense.forward_backward()
+
+
+def test_points_keep_their_place_on_a_mesh_that_moves(simulated: ModuleType) -> None:
+    grid = torch.stack(torch.meshgrid(torch.arange(4.0), torch.arange(4.0), indexing="ij"), -1).reshape(-1, 2)
+    vertices = 0.01 * torch.cat((grid, torch.zeros(16, 1)), dim=1)
+    corner = torch.tensor([4 * row + column for row in range(3) for column in range(3)])[:, None]
+    faces = torch.cat((corner + torch.tensor([0, 4, 1]), corner + torch.tensor([5, 1, 4])))
+    rotation = axis_angle_to_matrix(torch.tensor([0.3, -0.5, 0.8]))
+    motion = se3(rotation, torch.tensor([0.1, 0.2, 0.3]))
+    moved = vertices @ rotation.T + motion[:3, 3]
+    points = torch.tensor([[0.012, 0.007, 0.001], [0.025, 0.021, -0.002]])
+    carried = simulated.carried_by_mesh(points, simulated.Cloth(200, torch.stack((vertices, moved)), faces), 0)
+    torch.testing.assert_close(carried[:, 0], points)
+    torch.testing.assert_close(carried[:, 1], points @ rotation.T + motion[:3, 3])
+
+
+def test_true_points_on_the_cloth_are_carried_as_the_truth_says(simulated: ModuleType, shared_data: Path) -> None:
+    episode = simulated.read_simulated(shared_data / "sim" / "deformable")
+    for frame in episode.query.unique().tolist():
+        rows = (episode.query == frame) & (episode.body == episode.cloth.body)
+        carried = simulated.carried_by_mesh(episode.xyz[rows, frame], episode.cloth, frame)
+        error = (carried - episode.xyz[rows]).norm(dim=-1)
+        assert error.mean() < 1e-4
+        assert error.max() < 5e-3
