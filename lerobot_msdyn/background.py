@@ -1,11 +1,13 @@
-"""The static set of a fixed camera: one flat Gaussian per pixel of the temporal median."""
+"""The static set of a fixed camera: one flat Gaussian per pixel of the empty scene, as far as it was ever seen."""
 
 import math
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.cameras import CameraTrack
@@ -16,6 +18,66 @@ SIGMA_PX = 0.5  # standard deviation of a Gaussian, as a share of the spacing of
 FLATNESS = 0.2  # thickness along the surface normal, as a share of the width
 MAX_STRETCH = 4.0  # surfaces seen at a grazing angle are stretched at most so much
 OPACITY = 0.95
+SAMPLES = 60  # frames over which medians are taken where they suffice ...
+FEW = 10  # ... which is where so many of them show the empty scene; elsewhere all frames are looked at
+MARGIN_PX = 2  # what moves bleeds so far beyond its mask: blur, the codec, and the mask's own error
+INPAINT_RADIUS_PX = 3
+
+
+@dataclass(frozen=True)
+class EmptyScene:
+    """What a fixed camera sees where nothing moves."""
+
+    rgb: UInt8[Tensor, "h w 3"]  # where never seen, continued from the surroundings
+    depth: Float[Tensor, "h w"]  # m, 0 = unknown
+    seen: Int[Tensor, "h w"]  # frames that show it; at most those that were looked at
+
+
+def empty_scene(
+    rgb: UInt8[Tensor, "t h w 3"], depth: Float[Tensor, "t h w"], instances: UInt8[Tensor, "t h w"]
+) -> EmptyScene:
+    """Median colour and depth of every pixel over frames in which nothing moves there or close by.
+
+    Args:
+        rgb: the video.
+        depth: its z-depth (m, 0 = unknown).
+        instances: what moves, 0 = nothing.
+    """
+    frames, height, width = instances.shape
+    window = np.ones((2 * MARGIN_PX + 1,) * 2, np.uint8)
+    still = np.stack([cv2.dilate((mask > 0).astype(np.uint8), window) == 0 for mask in instances.numpy()])
+    colours, depths = rgb.numpy().reshape(frames, -1, 3), depth.numpy().reshape(frames, -1)
+    still = still.reshape(frames, -1)
+    sample = np.linspace(0, frames - 1, min(frames, SAMPLES)).round().astype(int)
+    values = np.concatenate((colours[sample], depths[sample, :, None]), axis=-1, dtype=np.float32)
+    seen = still[sample].sum(0)
+    rare = seen < min(FEW, len(sample))
+    median = _masked_median(values, still[sample])
+    if rare.any():
+        all_frames = np.concatenate((colours[:, rare], depths[:, rare, None]), axis=-1, dtype=np.float32)
+        median[rare] = _masked_median(all_frames, still[:, rare])
+        seen[rare] = still[:, rare].sum(0)
+    unknown = (seen == 0).reshape(height, width)
+    picture = median[:, :3].round().astype(np.uint8).reshape(height, width, 3)
+    if unknown.any() and not unknown.all():
+        picture = cv2.inpaint(picture, unknown.astype(np.uint8), INPAINT_RADIUS_PX, cv2.INPAINT_TELEA)
+    return EmptyScene(
+        torch.from_numpy(picture),
+        torch.from_numpy(median[:, 3].reshape(height, width)),
+        torch.from_numpy(seen.reshape(height, width)),
+    )
+
+
+def _masked_median(values: Float32[ndarray, "t p c"], usable: Bool[ndarray, "t p"]) -> Float32[ndarray, "p c"]:
+    """Median over usable frames, of the last channel over those in which it is not 0; 0 where there is none."""
+    usable = np.repeat(usable[..., None], values.shape[-1], axis=-1)
+    usable[..., -1] &= values[..., -1] > 0
+    ordered = np.sort(np.where(usable, values, np.float32(np.inf)), axis=0)
+    count = usable.sum(0)
+    middle = [
+        np.take_along_axis(ordered, at.clip(0, len(values) - 1)[None], 0)[0] for at in ((count - 1) // 2, count // 2)
+    ]
+    return np.where(count > 0, (middle[0] + middle[1]) / 2, np.float32(0)).astype(np.float32)
 
 
 def fill_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:

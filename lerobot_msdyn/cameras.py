@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -48,6 +49,14 @@ class CameraTrack:
         """The same camera with another number of pixels."""
         scale = torch.tensor([[width / self.width], [height / self.height], [1.0]], device=self.intrinsics.device)
         return replace(self, intrinsics=self.intrinsics * scale, width=width, height=height)
+
+
+def joined(parts: Sequence[CameraTrack]) -> CameraTrack:
+    """One camera's tracks over consecutive times, as one."""
+    intrinsics = torch.cat([part.intrinsics for part in parts])
+    return replace(
+        parts[0], intrinsics=intrinsics, world_from_camera=torch.cat([part.world_from_camera for part in parts])
+    )
 
 
 def intrinsics_from_fov(width: int, height: int, horizontal_fov_deg: float) -> Float[Tensor, "3 3"]:

@@ -12,6 +12,7 @@ import draccus
 
 # Named: draccus finds the comment above a field only where its annotation holds no quotes.
 Device = Literal["auto", "cpu", "cuda"]
+LevelName = Literal["object", "primitive", "grain", "particle", "flat", "field"]
 
 
 @dataclass
@@ -61,22 +62,55 @@ class PriorsConfig:
 class SceneConfig:
     """How many Gaussians, and from where."""
 
+    # Whether what one episode never shows of a fixed camera's background is taken from the others.
+    shared_background: bool = True
     # Upper bound for the static set; one Gaussian per pixel of the fitted image where it suffices.
     static_gaussians: int = 80_000
     # Upper bound for the moving set.
     moving_gaussians: int = 20_000
     # Number of frames from which the moving set is gathered.
     moving_frames: int = 20
+    # Pixels along the border of a mask, and beside depth edges, from which no moving point is taken.
+    mask_border_px: int = 1
     # Side of the voxels in which the gathered moving points are merged, in pixels of the fitted image.
     moving_voxel_px: float = 0.8
+    # Balls instead of ellipsoids.
+    isotropic: bool = False
+
+
+@dataclass
+class FramesPerKnot:
+    """Frames from one knot of a motion to the next; between them it is interpolated."""
+
+    # Objects.
+    object: int = 1
+    # Primitives.
+    primitive: int = 2
+    # Grains.
+    grain: int = 4
+    # Particles.
+    particle: int = 4
 
 
 @dataclass
 class MotionConfig:
     """The levels of motion."""
 
+    # Coarse to fine: object, then any of primitive, grain, particle; or flat or field alone: other systems' models.
+    levels: list[LevelName] = field(default_factory=lambda: ["object", "primitive", "grain"])
     # Rigid parts per moving instance at the object level (a robot arm is one instance with several parts).
     max_parts: int = 6
+    # Primitives per rigid part.
+    primitives: int = 5
+    # Grains per primitive.
+    grains: int = 10
+    # Particles in the whole scene.
+    particles: int = 512
+    # Bases of the flat model in the whole scene.
+    flat_bases: int = 10
+    # Keep a finer level, part by part, only where it predicts tracks better that it was not fitted to.
+    gate: bool = True
+    frames_per_knot: FramesPerKnot = field(default_factory=FramesPerKnot)
 
 
 @dataclass
@@ -104,17 +138,29 @@ class LearningRates:
     # Opacity logits.
     opacity_logits: float = 2e-2
     # Colour coefficients.
-    colours: float = 5e-3
+    colours: float = 1e-2
 
 
 @dataclass
 class FitConfig:
     """The optimisation."""
 
-    # Number of Adam steps; each draws one frame.
-    steps: int = 300
+    # Largest number of Adam steps; each draws one frame.
+    steps: int = 500
     # Widest image that is fitted, in pixels; wider videos are fitted at a reduced size and rendered at their own.
     max_width: int = 320
+    # Longest part of a video that is fitted as one scene, in frames; longer videos are cut into equal parts.
+    window_frames: int = 300
+    # Whether the static set's brightness follows the video (moving shadows, exposure).
+    shadows: bool = True
+    # Degree of the moving set's spherical harmonics, 0 or 1: how its colours change as it turns.
+    sh_degree: int = 1
+    # Share of the steps after which the moving set's brightness over time is measured; 1: never.
+    moving_gain_from: float = 0.6
+    # Frames that are not fitted but tell when to stop; 0: all steps are taken.
+    held_out_frames: int = 3
+    # Steps without improvement on the held-out frames after which the fit stops.
+    patience: int = 150
     weights: LossWeights = field(default_factory=LossWeights)
     learning_rates: LearningRates = field(default_factory=LearningRates)
 
@@ -227,11 +273,26 @@ def problems(config: object, prefix: str = "") -> list[str]:
         value = getattr(config, name)
         if not low <= value <= high:
             lines.append(f"{prefix}{name} is {value}; expected a value from {low} to {high}")
+    if isinstance(config, MotionConfig) and not _is_hierarchy(config.levels):
+        lines.append(
+            f"{prefix}levels is [{', '.join(config.levels)}]; expected [object], then any of primitive, grain (after "
+            "primitive) and particle in this order; or [flat] or [field] alone"
+        )
     for item in fields(config):  # type: ignore[arg-type]
         value = getattr(config, item.name)
         if is_dataclass(value):
             lines += problems(value, f"{prefix}{item.name}.")
     return lines
+
+
+def _is_hierarchy(levels: list[LevelName]) -> bool:
+    """Whether levels go from coarse to fine, each with what carries it."""
+    order = ("object", "primitive", "grain", "particle")
+    if levels in (["flat"], ["field"]):
+        return True
+    fine = list(levels[1:])
+    ascending = fine == [name for name in order[1:] if name in fine]
+    return levels[:1] == ["object"] and ascending and ("grain" not in fine or "primitive" in fine)
 
 
 # Class -> field -> what it may be, besides an exchange file.
@@ -256,12 +317,28 @@ _RANGES: dict[str, tuple[tuple[str, float, float], ...]] = {
         ("static_gaussians", 100, 10_000_000),
         ("moving_gaussians", 0, 10_000_000),
         ("moving_frames", 1, 100_000),
+        ("mask_border_px", 0, 100),
         ("moving_voxel_px", 0.05, 100),
     ),
-    "MotionConfig": (("max_parts", 1, 64),),
+    "MotionConfig": (
+        ("max_parts", 1, 64),
+        ("primitives", 1, 1000),
+        ("grains", 1, 1000),
+        ("particles", 1, 100_000),
+        ("flat_bases", 1, 10_000),
+    ),
+    "FramesPerKnot": tuple((name, 1, 1000) for name in ("object", "primitive", "grain", "particle")),
     "LossWeights": (("rgb", 0, _ANY), ("depth", 0, _ANY), ("mask", 0, _ANY)),
     "LearningRates": tuple((name, 0, 1) for name in ("means", "log_scales", "quats", "opacity_logits", "colours")),
-    "FitConfig": (("steps", 0, 1_000_000), ("max_width", 16, 8192)),
+    "FitConfig": (
+        ("steps", 0, 1_000_000),
+        ("max_width", 16, 8192),
+        ("window_frames", 1, 100_000),
+        ("sh_degree", 0, 1),
+        ("moving_gain_from", 0, 1),
+        ("held_out_frames", 0, 1000),
+        ("patience", 1, 1_000_000),
+    ),
     "OrbitConfig": (("azimuth_deg", 0, 90), ("elevation_deg", 0, 60), ("translation_rel", 0, 1)),
     "JitterConfig": (("translation_rel", 0, 1), ("rotation_deg", 0, 45)),
 }

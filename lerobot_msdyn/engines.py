@@ -9,7 +9,8 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 from lerobot_msdyn.config import AugmentConfig
 from lerobot_msdyn.episode import depth_key_of
 from lerobot_msdyn.errors import ConfigError, EpisodeError, MsdynError
-from lerobot_msdyn.pipeline import augment_episode
+from lerobot_msdyn.estimate import measure_speeds, predicted_seconds
+from lerobot_msdyn.pipeline import augment_episode, shared_backgrounds
 from lerobot_msdyn.write import NewEpisode, OutputDataset
 
 logger = logging.getLogger(__name__)
@@ -34,11 +35,13 @@ def run_local(
         def progress(what: str, share: float) -> None:
             if what:
                 bar.set_description_str(what)
-            bar.update(share)
+            bar.update(min(share, len(episodes) - bar.n))  # shares add up to one only up to rounding
 
+        bar.set_description_str("looking at the background")
+        backgrounds = shared_backgrounds(source, cameras, config)
         for done, index in enumerate(episodes, start=1):
             try:
-                new += augment_episode(source, index, cameras, config, output, progress)
+                new += augment_episode(source, index, cameras, config, output, progress, backgrounds)
             except EpisodeError as error:
                 logger.error("skipped: %s", error)
                 failures.append(error)
@@ -52,40 +55,19 @@ def run_local(
 
 
 def plan(source: LeRobotDatasetMetadata, episodes: list[int], cameras: list[str], config: AugmentConfig) -> str:
-    """What a run would do: episodes, pictures, disk and a rough time."""
+    """What a run would do: episodes, pictures, disk and time, the last by doing a little of it."""
     frames = sum(int(source.episodes[index]["length"]) for index in episodes)
     copies = config.variants + int(config.include_source)
     size = sum(file.stat().st_size for file in source.root.rglob("*") if file.is_file())
     disk = size * frames * copies / max(source.total_frames, 1)
-    seconds = 0.0
-    for key in cameras:
-        fitted = _fitted_pixels(source, key, config)
-        gaussians = min(fitted, config.scene.static_gaussians) + config.scene.moving_gaussians
-        seconds += frames * fitted * _PRIORS_S_PER_PIXEL
-        seconds += len(episodes) * config.fit.steps * gaussians * _STEP_S_PER_GAUSSIAN
-        seconds += frames * config.variants * _pixels(source, key) * _FRAME_S_PER_PIXEL
+    seconds = predicted_seconds(measure_speeds(source, episodes[0], cameras, config), source, episodes, config)
     return (
         f"{source.repo_id}: {len(episodes)} episodes, {frames} frames; re-rendering {', '.join(cameras)}\n"
         f"{config.variants} new per episode: {len(episodes) * copies} episodes, {frames * copies} frames, "
         f"{frames * config.variants * len(cameras)} new pictures\n"
-        f"about {disk / 1e6:.0f} MB on disk, and roughly {seconds / 60:.0f} minutes on two CPU cores\n"
+        f"about {disk / 1e6:.0f} MB on disk, and about {seconds / 60:.1f} minutes on this machine, "
+        "judging by a few frames and steps\n"
     )
-
-
-# Speeds of two CPU cores (320x240 with recorded depth, 640x480 without), for the estimate only.
-_PRIORS_S_PER_PIXEL = 3e-6
-_STEP_S_PER_GAUSSIAN = 6e-7
-_FRAME_S_PER_PIXEL = 4e-7
-
-
-def _pixels(source: LeRobotDatasetMetadata, key: str) -> int:
-    height, width = source.features[key]["shape"][:2]
-    return int(height * width)
-
-
-def _fitted_pixels(source: LeRobotDatasetMetadata, key: str, config: AugmentConfig) -> int:
-    scale = min(1.0, config.fit.max_width / source.features[key]["shape"][1])
-    return int(_pixels(source, key) * scale**2)
 
 
 def _say_what_is_assumed(source: LeRobotDatasetMetadata, cameras: list[str], config: AugmentConfig) -> None:

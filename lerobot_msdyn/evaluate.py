@@ -66,8 +66,8 @@ def evaluate_nvs(config: EvaluateConfig) -> dict[str, float]:
     config.priors.depth = {"recorded": "recorded", "none": "plane"}.get(config.depth, config.depth)
     start = time.perf_counter()
     scene = reconstruct(view, config)
-    seconds["priors and initialisation"] = time.perf_counter() - start - scene.result.seconds
-    seconds["fit"] = scene.result.seconds
+    seconds["priors and initialisation"] = time.perf_counter() - start - scene.seconds
+    seconds["fit"] = scene.seconds
     start = time.perf_counter()
     pictures = 0
     for path in sorted((folder / "gt" / "heldout").glob("*.npz")):

@@ -2,24 +2,30 @@
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from lerobot_msdyn.brightness import moving_gain, static_shading
 from lerobot_msdyn.config import FitConfig, LearningRates
 from lerobot_msdyn.episode import View
+from lerobot_msdyn.errors import EpisodeError
 from lerobot_msdyn.losses import certain_pixels, depth_loss, mask_loss, rgb_loss
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.rendering import Rendering, draw
-from lerobot_msdyn.scene import DynamicScene, Gaussians
+from lerobot_msdyn.scene import DynamicScene, Gaussians, with_slope
+from lerobot_msdyn.shading import no_shading
 
 logger = logging.getLogger(__name__)
 
 MASK_BAND_PX = 2  # the mask is not trusted closer than this to its border
 FINAL_RATE = 0.1  # the learning rates decay exponentially to this share
+CHECK_STEPS = 50  # from one look at the held-out frames to the next
+GAIN_DB = 0.02  # less than this is no improvement
+SCORED_FRAMES = 5  # of the recorded camera, whose error is reported
 
 
 @dataclass(frozen=True)
@@ -29,17 +35,26 @@ class FitResult:
     scene: DynamicScene
     losses: dict[str, float]  # mean of each unweighted term over the last tenth of the steps
     train_psnr_db: float  # over a few frames of the recorded camera
+    steps: int  # how many were taken
     seconds: float
 
 
 @dataclass(frozen=True)
 class _Targets:
-    """What one frame should look like."""
+    """What a video's frames should look like."""
 
-    rgb: Float[Tensor, "b h w 3"]
-    depth: Float[Tensor, "b h w"]
-    moving: Bool[Tensor, "b h w"]
-    certain: Bool[Tensor, "b h w"]
+    view: View
+    priors: Priors
+    certain: Bool[Tensor, "t h w"]  # where the mask can be trusted
+
+    def terms(self, drawn: Rendering, frames: Int[Tensor, " b"]) -> dict[str, Float[Tensor, ""]]:
+        """All loss terms, unweighted, by the names of their weights."""
+        moving = self.priors.instances[frames] > 0
+        return {
+            "rgb": rgb_loss(drawn.rgb, self.view.rgb[frames].float() / 255),
+            "depth": depth_loss(drawn.depth, self.priors.depth[frames], drawn.alpha),
+            "mask": mask_loss(drawn.moving, moving, self.certain[frames]),
+        }
 
 
 def fit(
@@ -64,61 +79,112 @@ def fit(
         seed: fixes the order of the frames.
         backend: of the rasterizer.
         progress: called with the number of steps done since the last call.
+
+    Raises:
+        EpisodeError: the loss is no finite number any more.
     """
     start = time.perf_counter()
+    if config.shadows:
+        scene = replace(scene, shading=static_shading(scene.static, len(scene.moving), view, priors))
+    if config.sh_degree > 0:
+        scene = replace(scene, moving=with_slope(scene.moving))
     scene, optimizer = _trainable(scene, config.learning_rates, distance)
     decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, FINAL_RATE ** (1 / max(config.steps, 1)))
-    generator = torch.Generator().manual_seed(seed)
-    order = torch.empty(0, dtype=torch.long)
+    targets = _Targets(view, priors, certain_pixels(priors.instances > 0, MASK_BAND_PX))
+    order, held_out = _frames(len(view.rgb), config.held_out_frames, seed)
+    enough = _Enough(view, held_out, config.patience, backend)
     history: list[dict[str, Tensor]] = []
-    for _ in range(config.steps):
-        if len(order) == 0:
-            order = torch.randperm(len(view.rgb), generator=generator)
-        frames, order = order[:1], order[1:]
-        terms = loss_terms(draw(scene, view.camera.select(frames), frames, backend), _targets(view, priors, frames))
+    for step in range(config.steps):
+        if step == int(config.moving_gain_from * config.steps) and len(scene.moving) > 0:
+            scene = _with_moving_gain(scene, view, priors, backend)
+        frames = next(order)
+        terms = targets.terms(draw(scene, view.camera.select(frames), frames, backend), frames)
         loss = torch.stack([getattr(config.weights, name) * term for name, term in terms.items()]).sum()
+        _check(loss, step, frames)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()
         decay.step()
         history.append({name: term.detach() for name, term in terms.items()})
         progress(1)
-    scene = _detached(scene)
-    last = history[-max(1, len(history) // 10) :]
-    losses = {name: float(torch.stack([step[name] for step in last]).mean()) for name in (last[0] if last else {})}
-    result = FitResult(scene, losses, train_psnr(scene, view, backend), time.perf_counter() - start)
-    logger.info(
-        "fit: %d + %d Gaussians, %d steps in %.0f s, %.1f dB on the recorded camera",
-        len(scene.static),
-        len(scene.moving),
-        config.steps,
-        result.seconds,
-        result.train_psnr_db,
-    )
-    return result
-
-
-def loss_terms(drawn: Rendering, targets: _Targets) -> dict[str, Float[Tensor, ""]]:
-    """All loss terms, unweighted, by the names of their weights."""
-    return {
-        "rgb": rgb_loss(drawn.rgb, targets.rgb),
-        "depth": depth_loss(drawn.depth, targets.depth, drawn.alpha),
-        "mask": mask_loss(drawn.moving, targets.moving, targets.certain),
-    }
+        if enough(scene, step + 1):
+            break
+    if len(history) < config.steps:
+        progress(config.steps - len(history))
+    return _result(_detached(scene), history, view, backend, time.perf_counter() - start)
 
 
 @torch.no_grad()
-def train_psnr(scene: DynamicScene, view: View, backend: str = "auto", count: int = 5) -> float:
-    """Peak signal-to-noise ratio (dB) of the drawn against the recorded pictures, over `count` evenly spread frames."""
-    frames = torch.linspace(0, len(view.rgb) - 1, min(count, len(view.rgb))).round().long()
+def psnr(scene: DynamicScene, view: View, frames: Int[Tensor, " b"], backend: str = "auto") -> float:
+    """Peak signal-to-noise ratio (dB) of the drawn against the recorded pictures."""
     drawn = draw(scene, view.camera.select(frames), frames, backend).rgb.clamp(0, 1)
     error = (drawn - view.rgb[frames].float() / 255).square().mean()
     return float(-10 * torch.log10(error.clamp(min=1e-10)))
 
 
-def _targets(view: View, priors: Priors, frames: Tensor) -> _Targets:
-    moving = priors.instances[frames] > 0
-    return _Targets(view.rgb[frames].float() / 255, priors.depth[frames], moving, certain_pixels(moving, MASK_BAND_PX))
+class _Enough:
+    """Whether held-out frames have stopped to improve."""
+
+    def __init__(self, view: View, held_out: Int[Tensor, " b"], patience: int, backend: str) -> None:
+        self.view, self.held_out, self.patience, self.backend = view, held_out, patience, backend
+        self.best_db, self.best_step = 0.0, 0
+
+    def __call__(self, scene: DynamicScene, steps: int) -> bool:
+        if len(self.held_out) == 0 or steps % CHECK_STEPS != 0:
+            return False
+        now_db = psnr(scene, self.view, self.held_out, self.backend)
+        if now_db > self.best_db + GAIN_DB:
+            self.best_db, self.best_step = now_db, steps
+        return steps - self.best_step >= self.patience
+
+
+def _frames(count: int, held_out: int, seed: int) -> tuple[Iterator[Int[Tensor, "1"]], Int[Tensor, " b"]]:
+    """The frames to train on, one by one without end, each once per round, and those that are held out.
+
+    Of short videos, with fewer than ten frames for each that would be held out, none is.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    apart = torch.zeros(count, dtype=torch.bool)
+    if held_out > 0 and count >= 10 * held_out:
+        apart[torch.linspace(0, count - 1, held_out + 2).round().long()[1:-1]] = True
+    train = (~apart).nonzero()[:, 0]
+
+    def endless() -> Iterator[Int[Tensor, "1"]]:
+        while True:
+            yield from train[torch.randperm(len(train), generator=generator)].split(1)
+
+    return endless(), apart.nonzero()[:, 0]
+
+
+def _check(loss: Float[Tensor, ""], step: int, frames: Int[Tensor, "1"]) -> None:
+    if not bool(torch.isfinite(loss)):
+        raise EpisodeError(
+            f"the fit diverged at step {step}, frame {int(frames)}: the loss is {loss.item()}; expected a finite "
+            "number; look at this episode's depth, or lower fit.learning_rates"
+        )
+
+
+def _with_moving_gain(scene: DynamicScene, view: View, priors: Priors, backend: str) -> DynamicScene:
+    shading = scene.shading or no_shading(len(scene.static), len(scene.moving), scene.frames)
+    return replace(scene, shading=replace(shading, moving=moving_gain(scene, view, priors, backend)))
+
+
+def _result(
+    scene: DynamicScene, history: list[dict[str, Tensor]], view: View, backend: str, seconds: float
+) -> FitResult:
+    last = history[-max(1, len(history) // 10) :]
+    losses = {name: float(torch.stack([step[name] for step in last]).mean()) for name in (last[0] if last else {})}
+    frames = torch.linspace(0, len(view.rgb) - 1, min(SCORED_FRAMES, len(view.rgb))).round().long()
+    result = FitResult(scene, losses, psnr(scene, view, frames, backend), len(history), seconds)
+    logger.info(
+        "fit: %d + %d Gaussians, %d steps in %.0f s, %.1f dB on the recorded camera",
+        len(scene.static),
+        len(scene.moving),
+        result.steps,
+        result.seconds,
+        result.train_psnr_db,
+    )
+    return result
 
 
 def _trainable(
@@ -137,7 +203,7 @@ def _trainable(
         for part in (scene.static, scene.moving)
     )
     groups = [{"params": [getattr(part, name)], "lr": lr} for part in (static, moving) for name, lr in rate.items()]
-    return replace(scene, static=static, moving=moving), torch.optim.Adam(groups, eps=1e-15)
+    return replace(scene, static=static, moving=moving), torch.optim.Adam(groups, eps=1e-15, fused=True)
 
 
 def _detached(scene: DynamicScene) -> DynamicScene:

@@ -114,6 +114,17 @@ def unproject_image(
     return unproject(xy, depth.reshape(-1), intrinsics).reshape(height, width, 3)
 
 
+def nearest_rotation(matrices: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotations R that maximise trace(R^T M); reflections are excluded by the determinant's sign (Kabsch-Umeyama).
+
+    Solved in float64: single precision loses the smallest singular vectors of thin sets.
+    """
+    u, _, vt = torch.linalg.svd(matrices.double())
+    sign = torch.ones(*matrices.shape[:-1], dtype=torch.float64, device=matrices.device)
+    sign[..., 2] = torch.linalg.det(u @ vt).sign()
+    return ((u * sign[..., None, :]) @ vt).to(matrices.dtype)
+
+
 def weighted_procrustes(
     source: Float[Tensor, "*batch n 3"],
     target: Float[Tensor, "*batch n 3"],
@@ -127,10 +138,6 @@ def weighted_procrustes(
     w = (weights / weights.sum(-1, keepdim=True).clamp(min=1e-12)).double()[..., None]
     x, y = source.double(), target.double()
     x_mean, y_mean = (w * x).sum(-2, keepdim=True), (w * y).sum(-2, keepdim=True)
-    covariance = (w * (y - y_mean)).transpose(-1, -2) @ (x - x_mean)
-    u, _, vt = torch.linalg.svd(covariance)
-    sign = torch.ones(*covariance.shape[:-1], dtype=torch.float64, device=x.device)
-    sign[..., 2] = torch.linalg.det(u @ vt).sign()
-    rotation = (u * sign[..., None, :]) @ vt
+    rotation = nearest_rotation((w * (y - y_mean)).transpose(-1, -2) @ (x - x_mean))
     translation = y_mean[..., 0, :] - (rotation @ x_mean[..., 0, :, None])[..., 0]
     return se3(rotation, translation).to(source.dtype)

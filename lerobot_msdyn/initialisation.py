@@ -9,22 +9,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lerobot_msdyn.background import background_gaussians, fill_depth, pixel_gaussians
+from lerobot_msdyn.background import EmptyScene, background_gaussians, empty_scene, fill_depth, pixel_gaussians
 from lerobot_msdyn.config import MotionConfig, SceneConfig
 from lerobot_msdyn.episode import View
-from lerobot_msdyn.geometry import (
-    invert_se3,
-    matrix_to_quaternion,
-    project,
-    quaternion_multiply,
-    se3,
-    transform_points,
-)
-from lerobot_msdyn.motion.bases import MotionLevel, carried, identity_level, level_affines
-from lerobot_msdyn.motion.initialise import ObjectMotion, object_motion
+from lerobot_msdyn.geometry import project, quaternion_multiply, transform_points
+from lerobot_msdyn.motion.initialise import SceneMotion, scene_motion
 from lerobot_msdyn.priors import Priors
-from lerobot_msdyn.priors.depth import static_depth
-from lerobot_msdyn.scene import DynamicScene, Gaussians, concatenate
+from lerobot_msdyn.scene import DynamicScene, Gaussians, concatenate, isotropic
 
 MASK_BORDER_PX = 1  # pixels along the border of a mask mix two surfaces
 FRONT_MARGIN = 0.01  # a point nearer than this share of the recorded depth is in front of it
@@ -33,7 +24,9 @@ VOXEL_GROWTH = 1.15  # of the voxels' side, until there are few enough
 EDGE_JUMP = 0.03  # relative difference of neighbouring depths beyond which a pixel may lie between two surfaces
 
 
-def initialise(view: View, priors: Priors, scene: SceneConfig, motion: MotionConfig) -> DynamicScene:
+def initialise(
+    view: View, priors: Priors, scene: SceneConfig, motion: MotionConfig, empty: EmptyScene | None = None
+) -> DynamicScene:
     """A scene ready to be fitted.
 
     Args:
@@ -41,22 +34,23 @@ def initialise(view: View, priors: Priors, scene: SceneConfig, motion: MotionCon
         priors: its priors, at the same size.
         scene: numbers of Gaussians.
         motion: the levels of motion.
+        empty: what stands still; default: as this video shows it.
     """
-    background = static_depth(priors.depth, priors.instances)
-    static = background_gaussians(priors.empty, background, view.camera, scene.static_gaussians)
-    frames = len(view.rgb)
-    objects = None
-    if scene.moving_gaussians > 0:
-        objects = object_motion(priors.tracks, priors.depth, view.camera, motion.max_parts)
-    if objects is None:
-        none = torch.zeros(0, dtype=torch.long)
-        return _scene(static, static.select(none), none, identity_level(torch.zeros(1, 3), frames), frames)
-    moving, part = gather_moving(view, priors, objects, scene)
-    return _scene(static, moving, part, objects.level, frames)
+    if empty is None:
+        empty = empty_scene(view.rgb, priors.depth, priors.instances)
+    static = background_gaussians(empty.rgb, empty.depth, view.camera, scene.static_gaussians)
+    found = scene_motion(priors.tracks, priors.depth, view.camera, motion) if scene.moving_gaussians > 0 else None
+    if found is None:
+        moving = static.select(torch.zeros(0, dtype=torch.long))
+        return DynamicScene(static, moving, (), (), (), len(view.rgb))
+    moving, part = gather_moving(view, priors, found, scene)
+    if scene.isotropic:
+        static, moving = isotropic(static), isotropic(moving)
+    return DynamicScene(static, moving, found.levels, *found.bind(moving.means, part), len(view.rgb))
 
 
 def gather_moving(
-    view: View, priors: Priors, objects: ObjectMotion, config: SceneConfig
+    view: View, priors: Priors, motion: SceneMotion, config: SceneConfig
 ) -> tuple[Gaussians, Int[Tensor, " n"]]:
     """Gaussians of everything that moves, in the canonical frame, and the part of which each is a piece.
 
@@ -67,13 +61,13 @@ def gather_moving(
     frames = torch.linspace(0, len(view.rgb) - 1, count).round().long().unique().tolist()
     gathered, parts = [], []
     for frame in frames:
-        inside = _certain(priors.instances[frame] > 0, priors.depth[frame]).reshape(-1)
+        inside = _certain(priors.instances[frame] > 0, priors.depth[frame], config.mask_border_px).reshape(-1)
         if not bool(inside.any()):
             continue
         pixels, _ = pixel_gaussians(view.rgb[frame], fill_depth(priors.depth[frame]), view.camera, frame)
         pixels = pixels.select(inside)
-        part = objects.assign(pixels.means, frame, priors.instances[frame].reshape(-1)[inside].long())
-        gathered.append(to_canonical(pixels, part, objects.level, frame))
+        canonical, part = to_canonical(pixels, motion, frame, priors.instances[frame].reshape(-1)[inside].long())
+        gathered.append(canonical)
         parts.append(part)
     if not gathered:
         empty = pixel_gaussians(view.rgb[0], fill_depth(priors.depth[0]), view.camera, 0)[0]
@@ -88,7 +82,7 @@ def gather_moving(
         growth *= VOXEL_GROWTH
         merged = merge_voxels(points, part, growth * voxel)
     moving, part = merged
-    kept = ~contradicted(moving.means, part, objects.level, view, priors, frames)
+    kept = ~contradicted(moving.means, part, motion, view, priors, frames)
     moving, part = moving.select(kept), part[kept]
     most = slice(config.moving_gaussians)  # one voxel per part may still be too many
     moving, part = moving.select(most), part[most]
@@ -98,7 +92,7 @@ def gather_moving(
 def contradicted(
     points: Float[Tensor, "n 3"],
     part: Int[Tensor, " n"],
-    level: MotionLevel,
+    motion: SceneMotion,
     view: View,
     priors: Priors,
     frames: list[int],
@@ -111,7 +105,7 @@ def contradicted(
     wrong, inside = torch.zeros(len(points)), torch.zeros(len(points))
     height, width = priors.depth.shape[1:]
     for frame in frames:
-        world = carried(level, part, points, frame)
+        world = motion.moved(points, part, torch.tensor([frame]))[0][0]
         camera = view.camera.select([frame])
         xy, z = project(transform_points(camera.camera_from_world, world[None])[0], camera.intrinsics[0])
         column, row = xy.floor().long().unbind(-1)
@@ -124,15 +118,14 @@ def contradicted(
     return wrong > MAX_CONTRADICTIONS * inside
 
 
-def to_canonical(gaussians: Gaussians, part: Int[Tensor, " n"], level: MotionLevel, frame: int) -> Gaussians:
-    """Gaussians at a frame, carried back to the canonical frame by the motion of their part."""
-    affine = level_affines(level, torch.tensor([frame]))[:, 0]
-    back = invert_se3(se3(affine[:, :, :3], affine[:, :, 3]))[part]
-    turn = matrix_to_quaternion(back[:, :3, :3])
-    means = (back[:, :3, :3] @ gaussians.means[:, :, None])[..., 0] + back[:, :3, 3]
-    return Gaussians(
-        means, quaternion_multiply(turn, gaussians.quats), gaussians.log_scales, gaussians.opacity_logits, gaussians.sh
-    )
+def to_canonical(
+    gaussians: Gaussians, motion: SceneMotion, frame: int, instance: Int[Tensor, " n"]
+) -> tuple[Gaussians, Int[Tensor, " n"]]:
+    """Gaussians seen at a frame, carried back to the canonical frame by the motion of their part, and that part."""
+    means, part = motion.to_canonical(gaussians.means, frame, instance)
+    turn = motion.moved(means, part, torch.tensor([frame]))[1][0]
+    back = turn * turn.new_tensor([1.0, -1.0, -1.0, -1.0])
+    return replace(gaussians, means=means, quats=quaternion_multiply(back, gaussians.quats)), part
 
 
 def merge_voxels(gaussians: Gaussians, part: Int[Tensor, " n"], voxel: float) -> tuple[Gaussians, Int[Tensor, " m"]]:
@@ -153,9 +146,9 @@ def merge_voxels(gaussians: Gaussians, part: Int[Tensor, " n"], voxel: float) ->
     return merged, part[first]
 
 
-def _certain(mask: Bool[Tensor, "h w"], depth: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
-    """Pixels well inside a mask, of known depth, and not at a depth edge."""
-    window = np.ones((2 * MASK_BORDER_PX + 1,) * 2, np.uint8)
+def _certain(mask: Bool[Tensor, "h w"], depth: Float[Tensor, "h w"], border: int) -> Bool[Tensor, "h w"]:
+    """Pixels `border` px inside a mask, of known depth, and as far from depth edges."""
+    window = np.ones((2 * border + 1,) * 2, np.uint8)
     inside = cv2.erode(mask.numpy().astype(np.uint8), window, borderType=cv2.BORDER_REPLICATE) > 0
     z = depth.numpy()
     edge = cv2.dilate(z, window) > (1 + EDGE_JUMP) * cv2.erode(z, window)
@@ -166,10 +159,3 @@ def _grown(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
     """A mask with its border, where it cannot be trusted."""
     window = np.ones((2 * MASK_BORDER_PX + 3,) * 2, np.uint8)
     return torch.from_numpy(cv2.dilate(mask.numpy().astype(np.uint8), window) > 0)
-
-
-def _scene(
-    static: Gaussians, moving: Gaussians, part: Int[Tensor, " n"], level: MotionLevel, frames: int
-) -> DynamicScene:
-    """A scene with one level in which each moving Gaussian follows one basis."""
-    return DynamicScene(static, moving, (level,), (part[:, None],), (torch.zeros(len(part), 1),), frames)

@@ -24,13 +24,13 @@ class Rendering:
 
 def draw(scene: DynamicScene, camera: CameraTrack, frames: Tensor, backend: str = "auto") -> Rendering:
     """The scene at `frames` (int, [b]) through the b poses of `camera`; differentiable."""
-    snapshot = scene.at(frames)
+    snapshot = scene.at(frames, camera.world_from_camera[:, :3, 3])
     raster: Raster = rasterize(
         snapshot.means,
         snapshot.quats,
         snapshot.scales,
         snapshot.opacities,
-        torch.cat((snapshot.rgb, snapshot.moving[:, None]), dim=-1),
+        torch.cat((snapshot.rgb, snapshot.moving[:, None].expand(len(frames), -1, 1)), dim=-1),
         camera.camera_from_world,
         camera.intrinsics,
         camera.width,

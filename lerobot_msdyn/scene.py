@@ -1,7 +1,7 @@
 """Gaussians, and a scene of a static and a moving set; saved as safetensors with a schema version."""
 
 import json
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import torch
@@ -11,11 +11,16 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from lerobot_msdyn.errors import MsdynError
+from lerobot_msdyn.geometry import quaternion_multiply, quaternion_to_matrix
 from lerobot_msdyn.motion.bases import MotionLevel
-from lerobot_msdyn.motion.compose import compose
+from lerobot_msdyn.motion.compose import Level, compose
+from lerobot_msdyn.motion.field import DeformationField
+from lerobot_msdyn.shading import Shading
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+LEVEL_KINDS: dict[str, type] = {"bases": MotionLevel, "field": DeformationField}
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic
+SH_C1 = 0.4886025119029199  # of the three linear ones
 
 
 @dataclass(frozen=True)
@@ -24,7 +29,7 @@ class Gaussians:
 
     means: Float[Tensor, "g 3"]  # m
     quats: Float[Tensor, "g 4"]  # wxyz, of any non-zero length
-    log_scales: Float[Tensor, "g 3"]  # log of standard deviations in m
+    log_scales: Float[Tensor, "g s"]  # log of standard deviations in m; s = 3, or 1 for isotropic Gaussians
     opacity_logits: Float[Tensor, " g"]
     sh: Float[Tensor, "g k 3"]
 
@@ -36,9 +41,26 @@ class Gaussians:
         """Colours 0..1 (degree 0)."""
         return (self.sh[:, 0] * SH_C0 + 0.5).clamp(min=0)
 
+    @property
+    def scales(self) -> Float[Tensor, "g 3"]:
+        """Standard deviations along the three axes, m."""
+        return self.log_scales.exp().expand(-1, 3)
+
     def select(self, which: Tensor | slice) -> "Gaussians":
         """Some of the Gaussians, by index, mask or slice."""
         return Gaussians(**{item.name: getattr(self, item.name)[which] for item in fields(self)})
+
+
+def with_slope(gaussians: Gaussians) -> Gaussians:
+    """The same set with spherical harmonics of degree 1, whose linear part is zero."""
+    return replace(gaussians, sh=torch.nn.functional.pad(gaussians.sh[:, :1], (0, 0, 0, 3)))
+
+
+def shaded(sh: Float[Tensor, "m 4 3"], direction: Float[Tensor, "b m 3"]) -> Float[Tensor, "b m 3"]:
+    """Colours 0..1 of spherical harmonics of degree 1 seen along directions of length 1 (in the canonical frame)."""
+    x, y, z = direction[..., None].unbind(-2)
+    linear = -y * sh[:, 1] + z * sh[:, 2] - x * sh[:, 3]
+    return (SH_C0 * sh[:, 0] + SH_C1 * linear + 0.5).clamp(min=0)
 
 
 def concatenate(parts: list[Gaussians]) -> Gaussians:
@@ -60,8 +82,13 @@ def gaussians_from_points(
         quats=quats.contiguous(),
         log_scales=scales.clamp(min=1e-6).log(),
         opacity_logits=logit.expand(len(means)).clone(),
-        sh=((rgb - 0.5) / SH_C0)[:, None].contiguous(),
+        sh=rgb_to_sh(rgb),
     )
+
+
+def rgb_to_sh(rgb: Float[Tensor, "g 3"]) -> Float[Tensor, "g 1 3"]:
+    """Colours 0..1 as spherical harmonics of degree 0."""
+    return ((rgb - 0.5) / SH_C0)[:, None].contiguous()
 
 
 @dataclass(frozen=True)
@@ -72,7 +99,7 @@ class Snapshot:
     quats: Float[Tensor, "b g 4"]
     scales: Float[Tensor, "g 3"]
     opacities: Float[Tensor, " g"]
-    rgb: Float[Tensor, "g 3"]
+    rgb: Float[Tensor, "b g 3"]
     moving: Float[Tensor, " g"]  # 1 for the moving set, 0 for the static one
 
 
@@ -82,35 +109,73 @@ class DynamicScene:
 
     static: Gaussians
     moving: Gaussians
-    levels: tuple[MotionLevel, ...]  # coarse to fine
-    indices: tuple[Int[Tensor, "n k"], ...]  # per level: the bases that move each Gaussian
-    logits: tuple[Float[Tensor, "n k"], ...]  # per level: their weights before the softmax
+    levels: tuple[Level, ...]  # coarse to fine
+    indices: tuple[Int[Tensor, "n _"], ...]  # per level: the bases that move each Gaussian
+    logits: tuple[Float[Tensor, "n _"], ...]  # per level: their weights before the softmax
     frames: int
+    shading: Shading | None = None  # none: brightness does not change
 
-    def at(self, frames: Int[Tensor, " b"]) -> Snapshot:
-        """The scene at some frames, differentiable in all Gaussians and bases."""
+    def at(self, frames: Int[Tensor, " b"], eye: Float[Tensor, "b 3"] | None = None) -> Snapshot:
+        """The scene at some frames, differentiable in all Gaussians and bases.
+
+        Args:
+            frames: the frames.
+            eye: from where it is seen at each (m), for colours that depend on it; without, their means are given.
+        """
         static, moving = self.static, self.moving
         means, quats = compose(moving.means, moving.quats, self.levels, self.indices, self.logits, frames)
         b = len(frames)
         return Snapshot(
             means=torch.cat((static.means.expand(b, -1, -1), means), dim=1),
             quats=torch.cat((static.quats.expand(b, -1, -1), quats), dim=1),
-            scales=torch.cat((static.log_scales, moving.log_scales)).exp(),
+            scales=torch.cat((static.scales, moving.scales)),
             opacities=torch.cat((static.opacity_logits, moving.opacity_logits)).sigmoid(),
-            rgb=torch.cat((static.rgb, moving.rgb)),
+            rgb=self._colours(frames, means, quats, eye),
             moving=torch.cat((torch.zeros_like(static.opacity_logits), torch.ones_like(moving.opacity_logits))),
         )
+
+    def _colours(
+        self,
+        frames: Int[Tensor, " b"],
+        means: Float[Tensor, "b m 3"],
+        quats: Float[Tensor, "b m 4"],
+        eye: Float[Tensor, "b 3"] | None,
+    ) -> Float[Tensor, "b g 3"]:
+        """Colours at some frames, given where the moving set is there and how it is turned."""
+        static = self.static.rgb.expand(len(frames), -1, -1)
+        moving = self.moving.rgb.expand(len(frames), -1, -1)
+        if eye is not None and self.moving.sh.shape[1] > 1:
+            back = quaternion_multiply(self.moving.quats, quats * torch.tensor([1.0, -1.0, -1.0, -1.0]))
+            sight = torch.nn.functional.normalize(means - eye[:, None], dim=-1)
+            moving = shaded(self.moving.sh, (quaternion_to_matrix(back) @ sight[..., None])[..., 0])
+        if self.shading is not None:
+            static = static * self.shading.static_gain(frames)[..., None]
+            moving = moving * self.shading.moving_gain(frames)[..., None]
+        return torch.cat((static, moving), dim=1)
+
+
+def isotropic(gaussians: Gaussians) -> Gaussians:
+    """The same Gaussians as balls of the same cross-section: the geometric mean of the two larger axes."""
+    two_larger = gaussians.log_scales.sort(dim=-1, descending=True).values[:, :2]
+    return replace(gaussians, log_scales=two_larger.mean(-1, keepdim=True))
 
 
 def save_scene(scene: DynamicScene, path: Path) -> None:
     """Write a scene as one safetensors file, atomically."""
     tensors: dict[str, Tensor] = {}
+    if scene.shading is not None:
+        tensors |= {f"shading.{item.name}": getattr(scene.shading, item.name) for item in fields(Shading)}
     for name, part in (("static", scene.static), ("moving", scene.moving)):
         tensors |= {f"{name}.{item.name}": getattr(part, item.name) for item in fields(part)}
     for i, level in enumerate(scene.levels):
         tensors |= {f"levels.{i}.{item.name}": getattr(level, item.name) for item in fields(level)}
         tensors |= {f"levels.{i}.indices": scene.indices[i], f"levels.{i}.logits": scene.logits[i]}
-    header = {"schema": SCHEMA_VERSION, "levels": len(scene.levels), "frames": scene.frames}
+    names = {kind: name for name, kind in LEVEL_KINDS.items()}
+    header = {
+        "schema": SCHEMA_VERSION,
+        "levels": [names[type(level)] for level in scene.levels],
+        "frames": scene.frames,
+    }
     partial = path.with_name(path.name + ".partial")
     save_file(
         {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()},
@@ -134,16 +199,20 @@ def load_scene(path: Path) -> DynamicScene:
         raise MsdynError(f"{path}: not a readable scene file ({error})") from error
     if header.get("schema") != SCHEMA_VERSION:
         raise MsdynError(f"{path}: scene schema is {header.get('schema')}; expected {SCHEMA_VERSION}; fit it again")
-    levels = range(header["levels"])
+    kinds = header.get("levels", [])
 
     def part(name: str, kind: type) -> dict[str, Tensor]:
         return {item.name: tensors[f"{name}.{item.name}"] for item in fields(kind)}
 
-    return DynamicScene(
-        static=Gaussians(**part("static", Gaussians)),
-        moving=Gaussians(**part("moving", Gaussians)),
-        levels=tuple(MotionLevel(**part(f"levels.{i}", MotionLevel)) for i in levels),
-        indices=tuple(tensors[f"levels.{i}.indices"] for i in levels),
-        logits=tuple(tensors[f"levels.{i}.logits"] for i in levels),
-        frames=header["frames"],
-    )
+    try:
+        return DynamicScene(
+            static=Gaussians(**part("static", Gaussians)),
+            moving=Gaussians(**part("moving", Gaussians)),
+            levels=tuple(LEVEL_KINDS[kind](**part(f"levels.{i}", LEVEL_KINDS[kind])) for i, kind in enumerate(kinds)),
+            indices=tuple(tensors[f"levels.{i}.indices"] for i in range(len(kinds))),
+            logits=tuple(tensors[f"levels.{i}.logits"] for i in range(len(kinds))),
+            frames=header["frames"],
+            shading=Shading(**part("shading", Shading)) if "shading.field" in tensors else None,
+        )
+    except KeyError as error:
+        raise MsdynError(f"{path}: not a readable scene file ({error} is missing)") from error

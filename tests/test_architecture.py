@@ -19,6 +19,7 @@ ONLY_IN = {
         "staging",
         "write",
         "pipeline",
+        "estimate",
         "engines",
         "augment",
         "evaluate",

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from lerobot_msdyn.background import background_gaussians, fill_depth, pixel_gaussians, surface_frames
+from lerobot_msdyn.background import background_gaussians, empty_scene, fill_depth, pixel_gaussians, surface_frames
 from lerobot_msdyn.cameras import CameraTrack, intrinsics_from_fov, static_camera
 from lerobot_msdyn.geometry import project, quaternion_to_matrix, transform_points, unproject_image
 from lerobot_msdyn.motion.bases import identity_level
@@ -88,3 +88,29 @@ def test_unknown_depth_is_taken_from_the_nearest_pixel() -> None:
     depth[1, 0], depth[1, 3] = 2.0, 5.0
     assert fill_depth(depth)[1].tolist() == [2.0, 2.0, 5.0, 5.0]
     assert (fill_depth(torch.zeros(3, 4)) == 1).all()
+
+
+def test_the_empty_scene_is_what_shows_when_nothing_is_in_front() -> None:
+    frames = 20
+    rgb = torch.full((frames, HEIGHT, WIDTH, 3), 90, dtype=torch.uint8)
+    depth, instances = torch.ones(frames, HEIGHT, WIDTH), torch.zeros(frames, HEIGHT, WIDTH, dtype=torch.uint8)
+    for frame in range(1, frames):  # something at 0.5 m leaves only at the first frame
+        rgb[frame, 8:16, 8:16], depth[frame, 8:16, 8:16], instances[frame, 8:16, 8:16] = 200, 0.5, 1
+    rgb[1:, 7, 8:16] = 140  # and bleeds beyond its mask
+    found = empty_scene(rgb, depth, instances)
+    assert (found.rgb == 90).all()
+    assert (found.depth == 1).all()
+    assert int(found.seen[12, 12]) == 1
+    assert int(found.seen[0, 0]) == frames
+
+
+def test_what_was_never_seen_is_continued_from_around_it() -> None:
+    rgb = torch.full((3, HEIGHT, WIDTH, 3), 90, dtype=torch.uint8)
+    instances = torch.zeros(3, HEIGHT, WIDTH, dtype=torch.uint8)
+    rgb[:, 8:16, 8:16], instances[:, 8:16, 8:16] = 200, 1
+    found = empty_scene(rgb, torch.ones(3, HEIGHT, WIDTH), instances)
+    assert ((found.rgb.int() - 90).abs() <= 2).all()
+    assert (found.seen[8:16, 8:16] == 0).all()
+    assert (found.depth[8:16, 8:16] == 0).all()
+    everything = empty_scene(rgb, torch.ones(3, HEIGHT, WIDTH), torch.ones_like(instances))
+    assert (everything.seen == 0).all()

@@ -62,6 +62,9 @@ def test_another_perturbation_type_drops_the_fields_of_the_old_one() -> None:
         (["--fit", "3"], "'fit' is 3; expected a mapping"),
         (["--variants", "0"], "variants is 0; expected a value from 1"),
         (["--camera.horizontal_fov_deg", "500"], "camera.horizontal_fov_deg is 500"),
+        (["--motion.levels", "[object,grain]"], r"motion.levels is \[object, grain\]; expected"),
+        (["--motion.levels", "[flat,object]"], "motion.levels is"),
+        (["--motion.levels", "[objects]"], "motion.levels.*objects"),
         (["--cameras", "front"], "cameras.*front.*list"),
         (["--repo", "[1]"], r"'repo_id' is \[1\]; expected text"),
         (["--include_source", "maybe"], "include_source.*maybe.*bool"),
@@ -147,5 +150,5 @@ def test_help_answers_without_importing_torch() -> None:
     assert "--fit.steps" in done.stdout
 
 
-def test_the_default_recipe_holds_the_defaults() -> None:
-    assert parse("--recipe", "default") == AugmentConfig()
+def test_the_balanced_recipe_holds_the_defaults() -> None:
+    assert parse("--recipe", "balanced") == AugmentConfig()

@@ -7,9 +7,10 @@ import torch
 
 from lerobot_msdyn.background import background_gaussians
 from lerobot_msdyn.cameras import intrinsics_from_fov, static_camera
-from lerobot_msdyn.config import FitConfig
+from lerobot_msdyn.config import FitConfig, LearningRates
 from lerobot_msdyn.episode import View
-from lerobot_msdyn.fitting import FitResult, fit, train_psnr
+from lerobot_msdyn.errors import EpisodeError
+from lerobot_msdyn.fitting import FitResult, fit, psnr
 from lerobot_msdyn.motion.bases import identity_level
 from lerobot_msdyn.priors import PointTracks, Priors
 from lerobot_msdyn.scene import DynamicScene
@@ -53,7 +54,7 @@ def run(steps: int, seed: int = 0) -> tuple[DynamicScene, FitResult]:
 def test_the_fit_gets_closer_to_the_recorded_pictures() -> None:
     view, _ = still_video()
     before, result = run(40)
-    assert result.train_psnr_db > train_psnr(before, view) + 6
+    assert result.train_psnr_db > psnr(before, view, torch.arange(FRAMES)) + 6
     assert set(result.losses) == {"rgb", "depth", "mask"}
     assert result.losses["depth"] < 0.05
 
@@ -108,3 +109,27 @@ def test_unknown_depth_is_no_obstacle(gone: str) -> None:
         seed=0,
     )
     assert torch.isfinite(result.scene.static.means).all()
+
+
+def test_the_fit_stops_when_held_out_frames_no_longer_improve() -> None:
+    view, priors = still_video()
+    many = dataclasses.replace(view, rgb=view.rgb[:1].expand(12, -1, -1, -1), camera=view.camera.select([0] * 12))
+    known = dataclasses.replace(
+        priors, depth=priors.depth[:1].expand(12, -1, -1), instances=priors.instances[:1].expand(12, -1, -1)
+    )
+    config = FitConfig(steps=400, held_out_frames=1, patience=50)
+    scene = dataclasses.replace(grey_scene(view), frames=12, levels=(identity_level(torch.zeros(1, 3), 12),))
+    config.learning_rates = LearningRates(0.0, 0.0, 0.0, 0.0, 0.0)  # nothing ever improves
+    seen: list[int] = []
+    result = fit(scene, many, known, config, distance=1.0, seed=0, progress=seen.append)
+    assert result.steps == 100
+    assert sum(seen) == 400
+
+
+def test_numbers_that_are_not_finite_end_the_fit() -> None:
+    view, priors = still_video()
+    scene = grey_scene(view)
+    config = FitConfig(steps=3)
+    config.weights.rgb = float("inf")
+    with pytest.raises(EpisodeError, match="diverged at step 0, frame"):
+        fit(scene, view, priors, config, distance=1.0, seed=0)

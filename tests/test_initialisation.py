@@ -9,10 +9,11 @@ from lerobot_msdyn.background import pixel_gaussians
 from lerobot_msdyn.cameras import intrinsics_from_fov, static_camera
 from lerobot_msdyn.config import MotionConfig, SceneConfig
 from lerobot_msdyn.episode import View
-from lerobot_msdyn.fitting import train_psnr
+from lerobot_msdyn.fitting import psnr
 from lerobot_msdyn.geometry import axis_angle_to_matrix, quaternion_to_matrix, se3, unproject
 from lerobot_msdyn.initialisation import contradicted, initialise, merge_voxels, to_canonical
 from lerobot_msdyn.motion.bases import identity_level, level_from_motions
+from lerobot_msdyn.motion.follow import SceneMotion
 from lerobot_msdyn.priors import PointTracks, Priors
 from lerobot_msdyn.scene import DynamicScene, gaussians_from_points
 from lerobot_msdyn.synthetic import make_scene
@@ -46,7 +47,7 @@ def initial(pushed: tuple[View, Priors]) -> DynamicScene:
 def test_the_initial_scene_already_shows_the_video(pushed: tuple[View, Priors], initial: DynamicScene) -> None:
     assert len(initial.moving) > 100
     assert initial.frames == FRAMES
-    assert train_psnr(initial, pushed[0]) > 17
+    assert psnr(initial, pushed[0], torch.arange(FRAMES)) > 17
 
 
 def test_bounds_on_the_number_of_gaussians_hold(pushed: tuple[View, Priors], initial: DynamicScene) -> None:
@@ -74,13 +75,30 @@ def test_a_scene_without_motion(pushed: tuple[View, Priors], why: str) -> None:
     assert scene.at(torch.tensor([0, FRAMES - 1])).means.shape == (2, len(scene.static), 3)
 
 
+def test_isotropic_gaussians_are_balls(pushed: tuple[View, Priors]) -> None:
+    scene = initialise(*pushed, SceneConfig(isotropic=True), MotionConfig(levels=["object"]))
+    assert scene.moving.log_scales.shape == (len(scene.moving), 1)
+    assert scene.at(torch.tensor([0])).scales.std(dim=1).max() == 0
+    assert psnr(scene, pushed[0], torch.arange(FRAMES)) > 15
+
+
+@pytest.mark.parametrize("levels", [["object", "primitive"], ["flat"], ["field"]])
+def test_every_model_of_motion_shows_the_video(pushed: tuple[View, Priors], levels: list) -> None:
+    scene = initialise(*pushed, SceneConfig(), MotionConfig(levels=levels))
+    assert len(scene.levels) == len(levels)
+    assert psnr(scene, pushed[0], torch.arange(FRAMES)) > 16
+
+
 def test_carried_back_by_the_motion_of_their_part() -> None:
     motions = torch.eye(4).repeat(2, 2, 1, 1)
     motions[1, 1] = se3(axis_angle_to_matrix(torch.tensor([0.0, 0.0, torch.pi / 2])), torch.tensor([1.0, 0.0, 0.0]))
     level = level_from_motions(motions, torch.zeros(2, 3))
+    tracked = torch.tensor([[0.5, 0.0, 1.0], [0.5, 0.0, 1.0]])
+    motion = SceneMotion(("object",), (level,), 0, tracked, torch.tensor([0, 1]), torch.tensor([1, 2]))
     points = torch.tensor([[0.5, 0.0, 1.0], [1.0, 0.5, 1.0]])
     seen = gaussians_from_points(points, torch.tensor([[1.0, 0, 0, 0]] * 2), torch.ones(2, 3), torch.ones(2, 3), 0.9)
-    back = to_canonical(seen, torch.tensor([0, 1]), level, 1)
+    back, part = to_canonical(seen, motion, 1, torch.tensor([1, 2]))
+    assert part.tolist() == [0, 1]
     # The second was at (0.5, 0, 1): a quarter turn makes it (0, 0.5, 1), the shift (1, 0.5, 1).
     torch.testing.assert_close(back.means, torch.tensor([[0.5, 0.0, 1.0], [0.5, 0.0, 1.0]]), atol=1e-6, rtol=0)
     turned = quaternion_to_matrix(back.quats[1])
@@ -122,7 +140,7 @@ def test_points_in_front_of_what_stands_still_are_contradicted() -> None:
     xy = torch.tensor([[15.0, 15.0], [30.0, 15.0], [30.0, 15.0], [-9.0, 15.0]])
     z = torch.tensor([0.9, 0.9, 1.1, 0.9])  # on the mask; in front of the wall; behind it; outside the image
     points = unproject(xy, z, camera.intrinsics[0])
-    found = contradicted(
-        points, torch.zeros(4, dtype=torch.long), identity_level(torch.zeros(1, 3), 4), view, priors, [0, 1, 2, 3]
-    )
+    nobody = torch.zeros(0, dtype=torch.long)
+    still = SceneMotion(("object",), (identity_level(torch.zeros(1, 3), 4),), 0, torch.zeros(0, 3), nobody, nobody)
+    found = contradicted(points, torch.zeros(4, dtype=torch.long), still, view, priors, [0, 1, 2, 3])
     assert found.tolist() == [False, True, False, False]

@@ -1,5 +1,6 @@
 """Scenes: what they hold at a time, saved and loaded."""
 
+import dataclasses
 from pathlib import Path
 
 import pytest
@@ -8,8 +9,19 @@ from safetensors.torch import save_file
 
 from lerobot_msdyn.errors import MsdynError
 from lerobot_msdyn.geometry import axis_angle_to_matrix, se3
-from lerobot_msdyn.motion.bases import level_from_motions
-from lerobot_msdyn.scene import DynamicScene, Gaussians, concatenate, gaussians_from_points, load_scene, save_scene
+from lerobot_msdyn.motion.bases import MotionLevel, level_from_motions
+from lerobot_msdyn.motion.field import DeformationField, fit_field
+from lerobot_msdyn.scene import (
+    DynamicScene,
+    Gaussians,
+    concatenate,
+    gaussians_from_points,
+    isotropic,
+    load_scene,
+    save_scene,
+    with_slope,
+)
+from lerobot_msdyn.shading import encode_gain, no_shading
 
 
 def some_gaussians(count: int, seed: int = 0) -> Gaussians:
@@ -79,6 +91,58 @@ def test_a_saved_scene_comes_back(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["scene.safetensors"]
 
 
+def test_all_kinds_of_levels_come_back(tmp_path: Path) -> None:
+    scene = scene_with_two_parts()
+    points = torch.randn(20, 3, generator=torch.Generator().manual_seed(0))
+    field = fit_field(points, points[:, None].expand(-1, 3, -1), torch.ones(20, 3), steps=2)
+    nothing = torch.zeros(3, 0)
+    scene = dataclasses.replace(
+        scene,
+        levels=(*scene.levels, field),
+        indices=(*scene.indices, nothing.long()),
+        logits=(*scene.logits, nothing),
+        moving=isotropic(scene.moving),
+    )
+    save_scene(scene, tmp_path / "scene.safetensors")
+    again = load_scene(tmp_path / "scene.safetensors")
+    assert [type(level) for level in again.levels] == [MotionLevel, DeformationField]
+    assert torch.equal(again.at(torch.tensor([1, 2])).means, scene.at(torch.tensor([1, 2])).means)
+    assert torch.equal(again.at(torch.tensor([1])).scales, scene.at(torch.tensor([1])).scales)
+
+
+def test_a_scene_without_some_of_its_arrays_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "scene.safetensors"
+    header = '{"schema": 2, "levels": ["bases"], "frames": 3}'
+    save_file({"static.means": torch.zeros(1, 3)}, path, metadata={"lerobot_msdyn": header})
+    with pytest.raises(MsdynError, match=r"not a readable scene file .*is missing"):
+        load_scene(path)
+
+
+def test_shading_is_saved_too(tmp_path: Path) -> None:
+    scene = scene_with_two_parts()
+    gains = torch.tensor([[1.0, 1.0, 1.0], [0.5, 1.0, 2.0], [1.0, 1.0, 1.0]])
+    shading = dataclasses.replace(no_shading(2, 3, 3), moving=encode_gain(gains))
+    save_scene(dataclasses.replace(scene, shading=shading), tmp_path / "scene.safetensors")
+    again = load_scene(tmp_path / "scene.safetensors").at(torch.tensor([1]))
+    torch.testing.assert_close(again.rgb[0, :2], scene.static.rgb)
+    torch.testing.assert_close(again.rgb[0, 2:], scene.moving.rgb * gains[1, :, None], atol=0.01, rtol=0)
+
+
+def test_colours_of_what_moves_depend_on_the_side_from_which_it_is_seen() -> None:
+    scene = scene_with_two_parts()
+    sloped = with_slope(scene.moving)
+    sloped.means[:] = 0
+    sloped.sh[:, 0] = 0
+    sloped.sh[:, 3] = -1  # brighter the more one looks along the canonical x
+    scene = dataclasses.replace(scene, moving=sloped)
+    along_x = scene.at(torch.tensor([0, 2]), torch.tensor([[-5.0, 0, 0]] * 2)).rgb[:, 2:, 0]
+    # At frame 2 the second part has turned a quarter about z: one looks along its own -y.
+    expected = torch.tensor([[0.5 + 0.4886025] * 3, [0.5 + 0.4886025, 0.5, 0.5]])
+    torch.testing.assert_close(along_x, expected)
+    from_nowhere = scene.at(torch.tensor([0, 2])).rgb[:, 2:]
+    torch.testing.assert_close(from_nowhere, torch.full_like(from_nowhere, 0.5))
+
+
 def test_what_is_no_scene_is_named(tmp_path: Path) -> None:
     path = tmp_path / "scene.safetensors"
     with pytest.raises(MsdynError, match="not a readable scene file"):
@@ -87,5 +151,5 @@ def test_what_is_no_scene_is_named(tmp_path: Path) -> None:
     with pytest.raises(MsdynError, match="not a readable scene file"):
         load_scene(path)
     save_file({"a": torch.zeros(1)}, path, metadata={"lerobot_msdyn": '{"schema": 99}'})
-    with pytest.raises(MsdynError, match="scene schema is 99; expected 1"):
+    with pytest.raises(MsdynError, match="scene schema is 99; expected 2"):
         load_scene(path)

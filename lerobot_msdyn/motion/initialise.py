@@ -1,85 +1,125 @@
-"""From tracks to the object level of motion: lift, choose a canonical frame, split into rigid parts, fit each."""
-
-from dataclasses import dataclass
+"""From tracks to the motion of a scene: lift, canonical frame, rigid parts, then one level after the other."""
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lerobot_msdyn.cameras import CameraTrack
-from lerobot_msdyn.geometry import invert_se3, transform_points
-from lerobot_msdyn.motion.bases import MotionLevel, carried, identity_level, level_from_motions
-from lerobot_msdyn.motion.gaps import STILL, fill_gaps, find_carriers
-from lerobot_msdyn.motion.lift import lift_tracks
+from lerobot_msdyn.config import LevelName, MotionConfig
+from lerobot_msdyn.geometry import transform_points
+from lerobot_msdyn.motion.bases import MotionLevel
+from lerobot_msdyn.motion.compose import Level
+from lerobot_msdyn.motion.field import fit_field
+from lerobot_msdyn.motion.finer import add_level
+from lerobot_msdyn.motion.flat import fit_flat
+from lerobot_msdyn.motion.follow import SceneMotion
+from lerobot_msdyn.motion.lift import LiftedTracks, lift_tracks, position_noise
+from lerobot_msdyn.motion.objects import canonical_frame, initialise_objects
+from lerobot_msdyn.motion.outliers import coherence
 from lerobot_msdyn.motion.parts import split_rigid_parts
-from lerobot_msdyn.motion.rigid import fit_rigid, model_points
+from lerobot_msdyn.motion.residual import ResidualTracks, pull_back
 from lerobot_msdyn.priors.types import PointTracks
 
 _MIN_SEEN = 3  # frames, and 5 % of the clip, in which a track must be seen
 _MIN_SEEN_SHARE = 0.05
-_MAX_TRACKS = 1500  # of an instance that are used, the longest ones
-_VOTERS = 5  # tracks that decide the part of a point
-_CHUNK = 4096  # points whose distances to all tracks are held at a time
+_MAX_TRACKS = 2500  # of an instance that are used, the longest ones
+_STILL_PX = 0.3  # an object that moves by less does not move
+_CANONICAL_FRAMES = 2.0  # about the canonical one, over which a point is averaged: the less, the farther away
+_MEAN_ROUNDS = 3  # of robust weights
+_OUTLIER = 3.0  # times the usual distance from the mean: half of the weight and more is lost
 
 
-@dataclass(frozen=True)
-class ObjectMotion:
-    """The object level: one rigid motion per part, and the tracks by which points find their part."""
-
-    level: MotionLevel
-    canonical_frame: int
-    points: Float[Tensor, "n 3"]  # m, tracked points at the canonical frame
-    part: Int[Tensor, " n"]  # index of the basis that each follows
-    instance: Int[Tensor, " n"]
-
-    def assign(self, points: Float[Tensor, "m 3"], frame: int, instance: Int[Tensor, " m"]) -> Int[Tensor, " m"]:
-        """Part of world points (m) seen at a frame: that of most of the five nearest tracks of the same instance.
-
-        All tracks take part, where their part has carried them, whether or not they are seen at that frame. Points
-        of an instance without tracks go by the nearest tracks of any.
-        """
-        moved = carried(self.level, self.part, self.points, frame)
-        out = torch.zeros(len(points), dtype=torch.long)
-        for label in instance.unique():
-            rows = (instance == label).nonzero()[:, 0]
-            tracks = (self.instance == label).nonzero()[:, 0]
-            if len(tracks) == 0:
-                tracks = torch.arange(len(self.points))
-            for some in rows.split(_CHUNK):
-                out[some] = self._vote(points[some], moved[tracks], self.part[tracks])
-        return out
-
-    def _vote(
-        self, points: Float[Tensor, "m 3"], tracked: Float[Tensor, "n 3"], part: Int[Tensor, " n"]
-    ) -> Int[Tensor, " m"]:
-        distance, nearest = torch.cdist(points, tracked).topk(min(_VOTERS, len(tracked)), largest=False)
-        votes = torch.zeros(len(points), len(self.level))
-        return votes.scatter_add_(1, part[nearest], 1 / distance.clamp(min=1e-6)).argmax(dim=1)
-
-
-def object_motion(
-    tracks: PointTracks, depth: Float[Tensor, "t h w"], camera: CameraTrack, max_parts: int
-) -> ObjectMotion | None:
+def scene_motion(
+    tracks: PointTracks, depth: Float[Tensor, "t h w"], camera: CameraTrack, config: MotionConfig
+) -> SceneMotion | None:
     """Motion of everything that was tracked, or None where nothing was.
 
     Args:
         tracks: points followed in the image.
         depth: z-depth in m, 0 = unknown.
         camera: the camera that saw both.
-        max_parts: bound on the rigid parts of one instance.
+        config: the levels.
     """
     xyz, valid = lift_tracks(tracks, depth, camera)
     kept = _longest(valid, tracks.instance)
     if len(kept) == 0:
         return None
     xyz, valid = xyz[kept], valid[kept]
-    confidence, instance = tracks.confidence[kept], tracks.instance[kept]
-    canonical = canonical_frame(valid, instance)
     in_camera = transform_points(camera.camera_from_world, xyz.transpose(0, 1))[..., 2].T[valid]
     pixel_m = float(in_camera.median() / camera.intrinsics[0, 0, 0])
-    part = split_rigid_parts(xyz, valid, confidence, instance, max_parts, pixel_m)
-    level, points = initialise_objects(xyz, valid, confidence, part, canonical)
-    return ObjectMotion(level, canonical, points, part, instance)
+    return motion_from_tracks(LiftedTracks(xyz, valid, tracks.confidence[kept], tracks.instance[kept], pixel_m), config)
+
+
+def motion_from_tracks(tracks: LiftedTracks, config: MotionConfig) -> SceneMotion:
+    """All levels of motion (the paper's section on initialisation; docs/method.md), from at least one track."""
+    noise = position_noise(tracks.xyz, tracks.valid)
+    canonical = canonical_frame(tracks.valid, tracks.instance)
+    part = split_rigid_parts(
+        tracks.xyz, tracks.valid, tracks.confidence, tracks.instance, config.max_parts, tracks.pixel_m
+    )
+    objects, points = initialise_objects(
+        tracks.xyz,
+        tracks.valid,
+        tracks.confidence,
+        part,
+        canonical,
+        still_m=_STILL_PX * tracks.pixel_m,
+        frames_per_knot=config.frames_per_knot.object,
+    )
+    weights = torch.where(tracks.valid, tracks.confidence.square(), 0.0)
+    names, levels = _first_level(config, objects, points, tracks.xyz, weights, canonical, noise)
+    positions = pull_back(objects, part[:, None], torch.zeros(len(part), 1), tracks.xyz)
+    start = near_canonical(positions, weights, canonical)
+    weights = weights * coherence(start, positions, tracks.valid, part, noise)
+    left = ResidualTracks(near_canonical(positions, weights, canonical), positions, weights, part, part)
+    for name in config.levels[1:]:
+        so_far = SceneMotion(names, levels, canonical, left.points, part, tracks.instance)
+        level, left = add_level(name, left, tracks, so_far, config, noise)
+        names, levels = (*names, name), (*levels, level)
+        points = _usual_positions(left.positions, weights, noise)
+    return SceneMotion(names, levels, canonical, points, part, tracks.instance)
+
+
+def _first_level(
+    config: MotionConfig,
+    objects: MotionLevel,
+    points: Float[Tensor, "n 3"],
+    xyz: Float[Tensor, "n t 3"],
+    weights: Float[Tensor, "n t"],
+    canonical: int,
+    noise: float,
+) -> tuple[tuple[LevelName, ...], tuple[Level, ...]]:
+    """The coarsest level: objects, or one of the two models of other systems, given the same canonical points."""
+    if config.levels[0] == "flat":
+        return ("flat",), (fit_flat(points, xyz, weights, config.flat_bases, canonical, noise),)
+    if config.levels[0] == "field":
+        return ("field",), (fit_field(points, xyz, weights),)
+    return ("object",), (objects,)
+
+
+def _usual_positions(
+    positions: Float[Tensor, "n t 3"], weights: Float[Tensor, "n t"], noise: float
+) -> Float[Tensor, "n 3"]:
+    """Robust mean over time of each track (Geman-McClure weights), once all levels have been taken out of it."""
+    trusted = weights.to(positions)
+    for _ in range(_MEAN_ROUNDS):
+        total = trusted.sum(1, keepdim=True).clamp(min=1e-12)
+        mean = torch.einsum("nt,ntc->nc", trusted, positions) / total
+        distance = (positions - mean[:, None]).norm(dim=-1)
+        usual = torch.where(weights > 0, distance, torch.nan).nanmedian(1, keepdim=True).values
+        scale = _OUTLIER * usual.clamp(min=max(noise, 1e-9))
+        trusted = weights / (1 + (distance / scale).square()).square()
+    return mean
+
+
+def near_canonical(
+    positions: Float[Tensor, "n t 3"], weights: Float[Tensor, "n t"], canonical: int
+) -> Float[Tensor, "n 3"]:
+    """Mean position about the canonical frame, or about the nearest frame in which a track was seen."""
+    apart = (torch.arange(positions.shape[1]) - canonical).abs().expand(weights.shape)
+    nearest = torch.where(weights > 0, apart, 10**9).amin(1, keepdim=True)
+    share = weights * torch.exp(-(apart - nearest).clamp(min=0) / _CANONICAL_FRAMES)
+    return torch.einsum("nt,ntc->nc", share, positions) / share.sum(1, keepdim=True).clamp(min=1e-12)
 
 
 def _longest(valid: Bool[Tensor, "n t"], instance: Int[Tensor, " n"]) -> Int[Tensor, " m"]:
@@ -91,80 +131,3 @@ def _longest(valid: Bool[Tensor, "n t"], instance: Int[Tensor, " n"]) -> Int[Ten
         rows = (enough & (instance == label)).nonzero()[:, 0]
         best.append(rows[seen[rows].argsort(descending=True, stable=True)[:_MAX_TRACKS]].sort().values)
     return torch.cat(best)
-
-
-def canonical_frame(valid: Bool[Tensor, "n t"], instance: Int[Tensor, " n"]) -> int:
-    """The frame in which the instances are seen best, each by its own measure, so that none yields to a larger one.
-
-    Ties go to the frame with more tracks, then to the one nearest the middle of the clip.
-    """
-    frames = valid.shape[1]
-    share = torch.zeros(frames, dtype=torch.float64)
-    for label in instance.unique():
-        seen = valid[instance == label].sum(0).double()
-        share += seen / seen.max().clamp(min=1)
-    total = valid.sum(0).double()
-    middle = (torch.arange(frames) - (frames - 1) / 2).abs()
-    ranking = sorted(range(frames), key=lambda t: (-round(share[t].item(), 9), -total[t].item(), middle[t].item()))
-    return ranking[0]
-
-
-def initialise_objects(
-    xyz: Float[Tensor, "n t 3"],
-    valid: Bool[Tensor, "n t"],
-    confidence: Float[Tensor, "n t"],
-    part: Int[Tensor, " n"],
-    canonical: int,
-) -> tuple[MotionLevel, Float[Tensor, "n 3"]]:
-    """One basis per part, the identity at the canonical frame, and every track's point (m) at that frame.
-
-    Where too few tracks support a part, it goes with the part that it moved with before (a held block with the
-    gripper), or stands still. A part that is never supported stands still altogether.
-    """
-    weights = torch.where(valid, confidence.square(), 0.0)
-    rows = [(part == k).nonzero()[:, 0] for k in range(int(part.max()) + 1)] if len(part) else []
-    fitted = [_fit_part(xyz[r], weights[r], None) for r in rows]
-    if not fitted:
-        return identity_level(torch.zeros(0, 3), xyz.shape[1]), torch.zeros(0, 3)
-    motions, accepted = (torch.stack([getattr(f, name) for f in fitted]) for name in ("motions", "accepted"))
-    carriers = find_carriers(motions, accepted, torch.stack([f.pivot for f in fitted]))
-    points = torch.zeros(len(xyz), 3)
-    # carriers are followed farther than what they carry, so they are completed first
-    for k in sorted(range(len(rows)), key=lambda k: -int(accepted[k].sum())):
-        carrier = int(carriers[k])
-        carry = None if carrier == STILL else motions[carrier]
-        fit = fitted[k] if carry is None else _fit_part(xyz[rows[k]], weights[rows[k]], carry)
-        filled = fill_gaps(fit.motions, fit.accepted, fit.pivot, carry)
-        motions[k] = filled @ invert_se3(filled[canonical])
-        points[rows[k]] = _canonical_points(xyz[rows[k]], weights[rows[k]], motions[k], fit.accepted).float()
-    pivots = torch.stack([points[r].mean(0) for r in rows])
-    return level_from_motions(motions.float(), pivots), points
-
-
-@dataclass(frozen=True)
-class _PartFit:
-    motions: Float[Tensor, "t 4 4"]  # from the part's own reference frame
-    accepted: Bool[Tensor, " t"]
-    pivot: Float[Tensor, "3"]  # m, at that frame
-
-
-def _fit_part(
-    xyz: Float[Tensor, "n t 3"], weights: Float[Tensor, "n t"], carry: Float[Tensor, "t 4 4"] | None
-) -> _PartFit:
-    fit = fit_rigid(xyz, weights[None], carry=None if carry is None else carry[None])
-    points, known = model_points(xyz, weights, fit)
-    seen = known[0] if known.any() else torch.ones_like(known[0])
-    return _PartFit(fit.motions[0], fit.support[0] > 0, points[0, seen].mean(0))
-
-
-def _canonical_points(
-    xyz: Float[Tensor, "n t 3"],
-    weights: Float[Tensor, "n t"],
-    motions: Float[Tensor, "t 4 4"],
-    accepted: Bool[Tensor, " t"],
-) -> Float[Tensor, "n 3"]:
-    """Tracks carried back, over the frames in which their part was followed; over all of them if that leaves none."""
-    back = transform_points(invert_se3(motions), xyz.transpose(0, 1).double())
-    followed = weights.double() * accepted
-    used = torch.where(followed.sum(1, keepdim=True) > 0, followed, weights.double())
-    return torch.einsum("nt,tnc->nc", used, back) / used.sum(1, keepdim=True).clamp(min=1e-12)

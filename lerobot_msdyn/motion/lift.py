@@ -1,9 +1,11 @@
 """Tracks in the image become tracks in the world."""
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray
 from torch import Tensor
 
@@ -13,8 +15,19 @@ from lerobot_msdyn.priors.types import PointTracks
 
 _EDGE_JUMP = 0.05  # relative difference of neighbouring depths that makes an edge
 _EDGE_MARGIN_PX = 2
-_DEPTH_WINDOW = 5  # frames of the temporal median
+_DEPTH_WINDOW = 5  # frames over which a track's depth is smoothed
 _NORMAL_MAD = 1.4826  # standard deviations in the median absolute deviation of a normal distribution
+
+
+@dataclass(frozen=True)
+class LiftedTracks:
+    """Tracks in the world."""
+
+    xyz: Float[Tensor, "n t 3"]  # m; meaningless where not valid
+    valid: Bool[Tensor, "n t"]
+    confidence: Float[Tensor, "n t"]  # 0..1
+    instance: Int[Tensor, " n"]
+    pixel_m: float  # size of a pixel where they are
 
 
 def lift_tracks(
@@ -22,8 +35,8 @@ def lift_tracks(
 ) -> tuple[Float[Tensor, "n t 3"], Bool[Tensor, "n t"]]:
     """World positions (m) of tracked points, and where they can be relied on.
 
-    Needs visibility, a known depth and 2 px of distance from a depth edge. Each track's depth is a temporal median
-    over five frames: noise along the ray dominates. From a teleport on, the shorter side of a track is dropped.
+    Needs visibility, a known depth and 2 px of distance from a depth edge. Each track's depth is that of a robust
+    line through five frames: noise along the ray dominates. From a teleport on, the shorter side of a track is dropped.
     Positions that are not valid are zero.
     """
     n, frames = tracks.visible.shape
@@ -35,7 +48,7 @@ def lift_tracks(
     time = torch.arange(frames).expand(n, -1)
     z = depth.cpu()[time, row, column]
     valid = tracks.visible & (z > 0) & ~edges[time, row, column]
-    z = _median_over_time(z, valid)
+    z = _smooth_over_time(z, valid)
     in_camera = unproject(tracks.xy.transpose(0, 1).contiguous(), z.T, camera.intrinsics)
     xyz = transform_points(camera.world_from_camera, in_camera).transpose(0, 1).contiguous()
     valid = _without_teleports(xyz, valid, tracks.instance)
@@ -62,11 +75,19 @@ def near_depth_edge(depth: Float32[ndarray, "h w"], margin_px: int = _EDGE_MARGI
     return cv2.dilate(edge, np.ones((side, side), np.uint8)) > 0
 
 
-def _median_over_time(z: Float[Tensor, "n t"], valid: Bool[Tensor, "n t"]) -> Float[Tensor, "n t"]:
-    """Temporal median over the valid entries of a window; zero where there is none."""
+def _smooth_over_time(z: Float[Tensor, "n t"], valid: Bool[Tensor, "n t"]) -> Float[Tensor, "n t"]:
+    """Robust line (Theil-Sen) through the valid entries of a window, at its middle; zero where there is none.
+
+    A median alone would lag behind what moves along the ray, the more so where entries of the window are missing.
+    """
     reach = _DEPTH_WINDOW // 2
     padded = torch.nn.functional.pad(torch.where(valid, z, torch.nan), (reach, reach), value=torch.nan)
-    return padded.unfold(1, _DEPTH_WINDOW, 1).nanmedian(dim=-1).values.nan_to_num(0.0)
+    window = padded.unfold(1, _DEPTH_WINDOW, 1)
+    offset = torch.arange(-reach, reach + 1).to(z)
+    first, second = torch.triu_indices(_DEPTH_WINDOW, _DEPTH_WINDOW, 1)
+    slopes = (window[..., second] - window[..., first]) / (offset[second] - offset[first])
+    slope = torch.where(window.isfinite().sum(-1) >= 3, slopes.nanmedian(dim=-1).values, 0.0)
+    return (window - slope[..., None] * offset).nanmedian(dim=-1).values.nan_to_num(0.0)
 
 
 def _without_teleports(

@@ -5,7 +5,7 @@ import math
 import torch
 
 from lerobot_msdyn.geometry import axis_angle_to_matrix, se3
-from lerobot_msdyn.motion.bases import MotionLevel, identity_level, level_affines, level_from_motions
+from lerobot_msdyn.motion.bases import identity_level, knot_frames, level_affines, level_from_motions, with_idle
 
 
 def test_identity_level_moves_nothing() -> None:
@@ -26,10 +26,28 @@ def test_level_of_motions_gives_the_motions_back() -> None:
 
 def test_an_inactive_basis_is_the_identity() -> None:
     motion = se3(axis_angle_to_matrix(torch.ones(2, 3, 3)), torch.ones(2, 3, 3))
-    level = level_from_motions(motion, torch.zeros(2, 3))
-    level = MotionLevel(
-        level.rotations_6d, level.displacements, level.pivots, level.parents, active=torch.tensor([True, False])
-    )
+    level = level_from_motions(motion, torch.zeros(2, 3), active=torch.tensor([True, False]))
     affines = level_affines(level, torch.arange(3))
     torch.testing.assert_close(affines[1], torch.eye(3, 4).expand(3, 3, 4))
     assert not torch.allclose(affines[0], torch.eye(3, 4).expand(3, 3, 4))
+
+
+def test_knots_meet_the_canonical_frame_and_both_ends() -> None:
+    assert knot_frames(10, 4, canonical=6).tolist() == [0, 2, 6, 9]
+    assert knot_frames(1, 4).tolist() == [0]
+
+
+def test_between_knots_a_motion_is_interpolated_and_beyond_them_held() -> None:
+    motions = torch.eye(4).repeat(1, 5, 1, 1)
+    motions[0, :, 0, 3] = torch.tensor([0.0, 9.0, 2.0, 9.0, 4.0])
+    level = level_from_motions(motions, torch.zeros(1, 3), frames_per_knot=2)
+    assert level.knots.tolist() == [0, 2, 4]
+    shift = level_affines(level, torch.tensor([-1.0, 1.0, 2.5, 4.0, 7.0]))[0, :, 0, 3]
+    torch.testing.assert_close(shift, torch.tensor([0.0, 1.0, 2.5, 4.0, 4.0]))
+
+
+def test_the_idle_basis_stands_last_and_still() -> None:
+    motion = se3(axis_angle_to_matrix(torch.ones(2, 3, 3)), torch.ones(2, 3, 3))
+    level = with_idle(level_from_motions(motion, torch.zeros(2, 3)))
+    assert level.active.tolist() == [True, True, False]
+    torch.testing.assert_close(level_affines(level, torch.arange(3))[2], torch.eye(3, 4).expand(3, 3, 4))

@@ -1,5 +1,6 @@
 """Composition of levels, and blending of bases."""
 
+import dataclasses
 import math
 
 import torch
@@ -59,7 +60,7 @@ def test_positions_do_not_depend_on_the_worlds_origin() -> None:
     means, quats = some_gaussians(5)
     index, logit = torch.tensor([[0, 1], [1, 2], [2, 0], [0, 2], [1, 0]]), torch.randn(5, 2)
     x, _ = compose(means, quats, (level,), (index,), (logit,), torch.tensor([1]))
-    moved = MotionLevel(level.rotations_6d, level.displacements, level.pivots + shift, level.parents, level.active)
+    moved = dataclasses.replace(level, pivots=level.pivots + shift)
     y, _ = compose(means + shift, quats, (moved,), (index,), (logit,), torch.tensor([1]))
     torch.testing.assert_close(y - shift, x, atol=2e-5, rtol=0)
 
@@ -113,7 +114,13 @@ def test_gradients_match_finite_differences() -> None:
     logits = torch.randn(4, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
 
     def positions(means: Tensor, rotations: Tensor, displacements: Tensor, logits: Tensor) -> Tensor:
-        moved = MotionLevel(rotations, displacements, level.pivots.double(), level.parents, level.active)
+        moved = dataclasses.replace(
+            level,
+            rotations_6d=rotations,
+            displacements=displacements,
+            pivots=level.pivots.double(),
+            knots=level.knots.double(),
+        )
         x, q = compose(means, quats, (moved,), (index,), (logits,), torch.tensor([1]))
         return torch.cat((x, q), dim=-1)
 
@@ -131,3 +138,33 @@ def test_no_gaussians_and_no_levels() -> None:
     x, q = compose(means, quats, (), (), (), torch.tensor([0, 1]))
     torch.testing.assert_close(x, means.expand(2, -1, -1))
     torch.testing.assert_close(q, quats.expand(2, -1, -1))
+
+
+def test_the_few_bases_that_are_named_equal_all_of_them_with_no_weight() -> None:
+    """Sparse equals dense: what a point does not name has no weight, so naming all bases gives the same."""
+    level = random_level(6, 3, 4)
+    means, quats = some_gaussians(8)
+    generator = torch.Generator().manual_seed(2)
+    few = torch.stack([torch.randperm(6, generator=generator)[:3] for _ in range(8)])
+    logits = torch.randn(8, 3, generator=generator)
+    every = torch.arange(6).expand(8, 6)
+    dense = torch.full((8, 6), -torch.inf).scatter_(1, few, logits)
+    times = torch.tensor([0, 1, 2])
+    sparse = compose(means, quats, (level,), (few,), (logits,), times)
+    full = compose(means, quats, (level,), (every,), (dense,), times)
+    for one, other in zip(sparse, full, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-6, rtol=1e-5)
+    permuted = torch.tensor([2, 0, 1])
+    again = compose(means, quats, (level,), (few[:, permuted],), (logits[:, permuted],), times)
+    torch.testing.assert_close(again[0], sparse[0], atol=1e-6, rtol=1e-5)
+
+
+def test_every_gaussian_moves_rigidly_at_its_centre() -> None:
+    """The pair of position and orientation is a motion in SE(3) of each Gaussian, blends included."""
+    level = random_level(3, 2, 6)
+    means, quats = some_gaussians(5)
+    index, logit = torch.tensor([[0, 1, 2]] * 5), torch.randn(5, 3, generator=torch.Generator().manual_seed(3))
+    _, q = compose(means, quats, (level,), (index,), (logit,), torch.tensor([1]))
+    R = quaternion_to_matrix(q[0])
+    torch.testing.assert_close(R @ R.transpose(1, 2), torch.eye(3).expand(5, 3, 3), atol=1e-5, rtol=0)
+    torch.testing.assert_close(torch.linalg.det(R), torch.ones(5), atol=1e-5, rtol=0)

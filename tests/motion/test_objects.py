@@ -3,10 +3,8 @@
 import torch
 from torch import Tensor
 
-from lerobot_msdyn.cameras import static_camera
 from lerobot_msdyn.motion.bases import level_affines
-from lerobot_msdyn.motion.initialise import ObjectMotion, canonical_frame, initialise_objects, object_motion
-from lerobot_msdyn.priors import PointTracks
+from lerobot_msdyn.motion.objects import canonical_frame, initialise_objects
 
 
 def moved(level, part: int, points: Tensor) -> Tensor:
@@ -75,41 +73,11 @@ def test_ties_go_to_the_middle_of_the_clip() -> None:
     assert canonical_frame(torch.ones(4, 9, dtype=torch.bool), torch.ones(4, dtype=torch.long)) == 4
 
 
-def test_points_find_the_part_they_belong_to(tumbling, late) -> None:
-    level, points = fit([tumbling, late], 0)
-    motion = ObjectMotion(level, 0, points, torch.arange(2).repeat_interleave(60), torch.tensor([1] * 60 + [2] * 60))
-    at = torch.cat((tumbling.xyz[:7, 20], late.xyz[:5, 20])) + 0.001
-    unknown = torch.full((12,), 9)  # an instance without tracks: the nearest of any
-    assert motion.assign(at, 20, unknown).tolist() == [0] * 7 + [1] * 5
-    # the mask knows better than the distance
-    assert motion.assign(tumbling.xyz[:7, 20], 20, torch.full((7,), 2)).tolist() == [1] * 7
-    assert motion.assign(torch.zeros(0, 3), 20, torch.zeros(0, dtype=torch.long)).shape == (0,)
-
-
-def test_from_the_image_to_the_motion() -> None:
-    """A square that slides by 1 px a frame at 2 m from a camera of 100 px focal length: 2 cm a frame."""
-    frames = 12
-    x, y = torch.meshgrid(torch.arange(10.0, 22, 2), torch.arange(16.0, 28, 2), indexing="xy")
-    xy = torch.stack((x, y), dim=-1).reshape(-1, 1, 2) + torch.arange(frames)[:, None] * torch.tensor([1.0, 0.0])
-    n = len(xy)
-    tracks = PointTracks(
-        xy, torch.ones(n, frames, dtype=torch.bool), torch.ones(n, frames), torch.ones(n, dtype=torch.long)
-    )
-    K = torch.tensor([[100.0, 0.0, 32.0], [0.0, 100.0, 24.0], [0.0, 0.0, 1.0]])
-    result = object_motion(tracks, torch.full((frames, 48, 64), 2.0), static_camera(K, frames, 64, 48), 4)
-    assert result is not None
-    assert len(result.level) == 1
-    shift = (torch.arange(frames) - result.canonical_frame)[:, None] * torch.tensor([0.02, 0.0, 0.0])
-    torch.testing.assert_close(result.level.displacements[0], shift, atol=1e-5, rtol=0)
-
-
-def test_without_usable_tracks_there_is_no_motion() -> None:
-    frames = 4
-    tracks = PointTracks(
-        torch.full((3, frames, 2), 10.0),
-        torch.ones(3, frames, dtype=torch.bool),
-        torch.ones(3, frames),
-        torch.ones(3, dtype=torch.long),
-    )
-    camera = static_camera(torch.eye(3), frames, 64, 48)
-    assert object_motion(tracks, torch.zeros(frames, 48, 64), camera, 4) is None
+def test_what_hardly_moves_does_not_move(tumbling, resting) -> None:
+    xyz = torch.cat((tumbling.xyz, resting.xyz))
+    xyz = xyz + 5e-4 * torch.randn(xyz.shape, generator=torch.Generator().manual_seed(0))
+    part = torch.arange(2).repeat_interleave(60)
+    seen = torch.ones(xyz.shape[:2])
+    level, _ = initialise_objects(xyz, seen > 0, seen, part, 0, still_m=1e-3)
+    assert level.active.tolist() == [True, False]
+    torch.testing.assert_close(level_affines(level, torch.tensor([20]))[1, 0], torch.eye(3, 4))

@@ -1,0 +1,93 @@
+"""How long a run will take, from a few frames and steps of its first episode."""
+
+import statistics
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from lerobot.datasets import LeRobotDatasetMetadata
+
+from lerobot_msdyn.config import Recipe
+from lerobot_msdyn.episode import View, read_episode
+from lerobot_msdyn.pipeline import FURTHER_STEPS, by_feature, new_pictures, reads_files, reconstruct
+from lerobot_msdyn.shared import MAX_EPISODES
+from lerobot_msdyn.staging import stage_pictures
+
+PROBE_FRAMES = 24
+PROBE_STEPS = 14
+WARM_UP_STEPS = 4  # the first ones compile, and fill caches
+
+
+@dataclass(frozen=True)
+class Speeds:
+    """Seconds that each part of the work takes, for all cameras together."""
+
+    read_s: float  # per frame
+    prepare_s: float  # per frame: priors and initial scene
+    step_s: float  # per step of the fit
+    render_s: float  # per new frame, encoded
+
+
+def measure_speeds(source: LeRobotDatasetMetadata, index: int, cameras: list[str], recipe: Recipe) -> Speeds:
+    """Time every stage on the middle of one episode.
+
+    Raises:
+        EpisodeError: the episode cannot be read.
+        PriorError: a prior was demanded and cannot be had.
+    """
+    start = time.perf_counter()
+    episode = read_episode(source, index, cameras, recipe.camera, recorded_depth=recipe.priors.depth != "plane")
+    frames = len(episode.time)
+    read_s = (time.perf_counter() - start) / frames
+    short = replace(
+        recipe,
+        fit=replace(recipe.fit, steps=PROBE_STEPS, held_out_frames=0),
+        priors=replace(recipe.priors, cache="off"),
+    )
+    views = episode.views
+    if not reads_files(recipe):  # a file is for the whole episode
+        views = {key: _middle(view) for key, view in views.items()}
+    prepare_s = step_s = render_s = 0.0
+    for key, part in views.items():
+        ticks: list[float] = []
+
+        def tick(share: float, to: list[float] = ticks) -> None:
+            to.append(time.perf_counter())
+
+        start = time.perf_counter()
+        others = [other for name, other in views.items() if name != key]
+        scene = reconstruct(part, short, tick, others=others, episode=index, key=key)
+        prepare_s += (time.perf_counter() - start - scene.seconds) / len(part.rgb)
+        steps = [
+            after - before for before, after in zip(ticks[WARM_UP_STEPS:], ticks[WARM_UP_STEPS + 1 :], strict=False)
+        ]
+        step_s += statistics.median(steps)
+        with tempfile.TemporaryDirectory() as folder:
+            start = time.perf_counter()
+            pictures = by_feature(source, {key: new_pictures(scene, part.camera)})
+            stage_pictures(source, Path(folder), pictures, len(part.rgb))
+            render_s += (time.perf_counter() - start) / len(part.rgb)
+    return Speeds(read_s, prepare_s, step_s, render_s)
+
+
+def predicted_seconds(speeds: Speeds, source: LeRobotDatasetMetadata, episodes: list[int], recipe: Recipe) -> float:
+    """Time of a whole run."""
+    lengths = [int(source.episodes[index]["length"]) for index in episodes]
+    steps, seconds = float(recipe.fit.steps), 0.0
+    if recipe.scene.shared_background and source.total_episodes > 1:
+        looked_at = min(MAX_EPISODES, source.total_episodes)
+        seconds = looked_at * speeds.read_s * source.total_frames / source.total_episodes + steps / 2 * speeds.step_s
+        steps *= FURTHER_STEPS
+    for frames in lengths:
+        windows = -(-frames // recipe.fit.window_frames)
+        seconds += frames * (speeds.read_s + speeds.prepare_s + recipe.variants * speeds.render_s)
+        seconds += windows * steps * speeds.step_s
+    return seconds
+
+
+def _middle(view: View) -> View:
+    start = max(0, (len(view.rgb) - PROBE_FRAMES) // 2)
+    part = slice(start, start + PROBE_FRAMES)
+    depth = None if view.depth is None else view.depth[part]
+    return View(view.rgb[part], view.camera.select(part), depth, view.depth_range)

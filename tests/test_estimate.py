@@ -1,0 +1,29 @@
+"""The time of a run, from the speeds of its parts."""
+
+from pathlib import Path
+
+import pytest
+
+from lerobot_msdyn.config import Recipe
+from lerobot_msdyn.episode import open_source
+from lerobot_msdyn.estimate import Speeds, measure_speeds, predicted_seconds
+
+
+def test_every_part_is_timed(desk: Path) -> None:
+    source = open_source("local/desk", desk)
+    speeds = measure_speeds(source, 0, ["observation.images.front"], Recipe())
+    assert 0 < speeds.read_s < 1
+    assert 0 < speeds.prepare_s < 5
+    assert 0 < speeds.step_s < 1
+    assert 0 < speeds.render_s < 5
+
+
+def test_parts_are_added_up(desk: Path) -> None:
+    source = open_source("local/desk", desk)  # three episodes of twelve frames
+    recipe = Recipe(variants=2)
+    recipe.fit.steps, recipe.fit.window_frames, recipe.scene.shared_background = 100, 6, False
+    speeds = Speeds(read_s=1.0, prepare_s=2.0, step_s=3.0, render_s=4.0)
+    assert predicted_seconds(speeds, source, [0, 2], recipe) == pytest.approx(2 * (12 * (1 + 2 + 2 * 4) + 2 * 100 * 3))
+    recipe.scene.shared_background = True
+    shared = 3 * 12 * 1 + 50 * 3 + 2 * (12 * (1 + 2 + 2 * 4) + 2 * 60 * 3)
+    assert predicted_seconds(speeds, source, [0, 2], recipe) == pytest.approx(shared)

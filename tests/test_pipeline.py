@@ -1,0 +1,93 @@
+"""From a video to its scenes and new pictures, also where the video is not as one would wish."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from lerobot_msdyn.config import Recipe
+from lerobot_msdyn.episode import View
+from lerobot_msdyn.pipeline import new_pictures, reconstruct
+from lerobot_msdyn.synthetic import make_scene
+
+FRAMES, WIDTH, HEIGHT = 12, 64, 48
+
+
+@pytest.fixture(scope="module")
+def pushed() -> View:
+    scene = make_scene("push", 0, FRAMES, WIDTH, HEIGHT)
+    seen = scene.render(scene.camera)
+    return View(seen.rgb, scene.camera, seen.depth)
+
+
+def recipe(steps: int = 10) -> Recipe:
+    found = Recipe()
+    found.fit.steps = steps
+    return found
+
+
+def some(view: View, frames: list[int]) -> View:
+    """Some frames of a video, also repeated."""
+    depth = None if view.depth is None else view.depth[frames]
+    return View(view.rgb[frames], view.camera.select(frames), depth)
+
+
+def check(view: View, settings: Recipe) -> None:
+    """Every frame can be drawn, and looks about like the recorded one from the recorded camera."""
+    pictures = list(new_pictures(reconstruct(view, settings), view.camera))
+    assert len(pictures) == len(view.rgb)
+    for picture, recorded in zip(pictures, view.rgb, strict=True):
+        assert picture.rgb.shape == (HEIGHT, WIDTH, 3)
+        assert abs(picture.rgb.astype(int) - recorded.numpy()).mean() < 40
+        assert torch.isfinite(torch.from_numpy(picture.depth)).all()
+
+
+@pytest.mark.parametrize("frames", [1, 2, 5])
+def test_very_short_videos(pushed: View, frames: int) -> None:
+    check(some(pushed, list(range(frames))), recipe())
+
+
+def test_nothing_moves(pushed: View) -> None:
+    check(some(pushed, [3] * FRAMES), recipe())
+
+
+def test_everything_moves(pushed: View) -> None:
+    rolled = torch.stack([image.roll(5 * t, dims=1) for t, image in enumerate(pushed.rgb)])
+    check(dataclasses.replace(pushed, rgb=rolled), recipe())
+
+
+def test_a_frozen_stretch(pushed: View) -> None:
+    check(some(pushed, [0, 1, 2, 3, 3, 3, 3, 3, 4, 5, 6, 7]), recipe())
+
+
+def test_a_black_stretch(pushed: View) -> None:
+    rgb = pushed.rgb.clone()
+    rgb[4:7] = 0
+    pictures = list(new_pictures(reconstruct(dataclasses.replace(pushed, rgb=rgb), recipe()), pushed.camera))
+    assert len(pictures) == FRAMES
+
+
+def test_a_cut(pushed: View) -> None:
+    rgb = pushed.rgb.clone()
+    rgb[6:] = rgb[6:].flip(2)
+    pictures = list(new_pictures(reconstruct(dataclasses.replace(pushed, rgb=rgb), recipe()), pushed.camera))
+    assert len(pictures) == FRAMES
+
+
+@pytest.mark.parametrize("scale", [0.1, 30.0])
+def test_depth_of_the_wrong_scale(pushed: View, scale: float) -> None:
+    assert pushed.depth is not None
+    check(dataclasses.replace(pushed, depth=pushed.depth * scale), recipe())
+
+
+def test_a_long_video_is_fitted_in_windows(pushed: View) -> None:
+    settings = recipe()
+    settings.fit.window_frames = 5
+    found = reconstruct(pushed, settings)
+    assert found.starts == (0, 4, 8)
+    assert [result.scene.frames for result in found.results] == [4, 4, 4]
+    check(pushed, settings)
+    frames = torch.tensor([7, 0, 9])
+    whole = list(new_pictures(found, pushed.camera))
+    for picture, frame in zip(new_pictures(found, pushed.camera.select(frames), frames), frames, strict=True):
+        assert abs(picture.rgb.astype(int) - whole[int(frame)].rgb).max() <= 1
