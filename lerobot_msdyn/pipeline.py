@@ -1,6 +1,7 @@
 """The whole flow on one screen: an episode in, a scene per camera, new episodes out."""
 
 import contextlib
+import functools
 import itertools
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -185,20 +186,15 @@ def reconstruct(
         def within(share: float, done: int = number) -> object:
             return progress((done + share) / len(windows))
 
-        def priors_of(
-            part: View, elsewhere: UInt8[Tensor, "m h w 3"] | None, others: Sequence[View] = [v[number] for v in beside]
-        ) -> Priors:
-            return estimate_priors(
-                part,
-                recipe.priors,
-                recipe.camera,
-                others=others,
-                elsewhere=elsewhere,
-                episode=episode,
-                key=key,
-                device=recipe.device,
-            )
-
+        priors_of = functools.partial(
+            estimate_priors,
+            config=recipe.priors,
+            camera=recipe.camera,
+            others=[parts[number] for parts in beside],
+            episode=episode,
+            key=key,
+            device=recipe.device,
+        )
         fitted.append(_fit_window(shrink(window, recipe.fit.max_width), recipe, within, backgrounds, priors_of))
     results, known, distances, cameras = zip(*fitted, strict=True)
     starts = tuple(start for start, _ in windows)
@@ -229,13 +225,13 @@ def _fit_window(
     recipe: Recipe,
     progress: Callable[[float], object],
     backgrounds: Sequence[SharedBackground],
-    priors_of: Callable[[View, UInt8[Tensor, "m h w 3"] | None], Priors],
+    priors_of: Callable[..., Priors],
 ) -> tuple[FitResult, Priors, float, CameraTrack]:
     """A fitted scene of one window at the size at which it is fitted, its priors, look-at distance (m) and camera."""
     steps, settings = recipe.fit.steps, recipe.scene
     with _one_torch_thread():
         shared = next((background for background in backgrounds if background.fits(view)), None)
-        priors = priors_of(view, None if shared is None else shared.frames)
+        priors = priors_of(view, elsewhere=None if shared is None else shared.frames)
         view = replace(view, camera=priors.camera or view.camera)
         if not view.camera.is_static:
             logger.warning("the camera moves, but the empty scene is built as if it were fixed: expect blur")
