@@ -51,7 +51,7 @@ class CameraTrack:
         return replace(self, intrinsics=self.intrinsics * scale, width=width, height=height)
 
 
-def joined(parts: Sequence[CameraTrack]) -> CameraTrack:
+def concatenated(parts: Sequence[CameraTrack]) -> CameraTrack:
     """One camera's tracks over consecutive times, as one."""
     intrinsics = torch.cat([part.intrinsics for part in parts])
     return replace(

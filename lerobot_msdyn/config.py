@@ -215,6 +215,12 @@ class Recipe:
     fit: FitConfig = field(default_factory=FitConfig)
     perturbation: PerturbationConfig = field(default_factory=OrbitConfig)
 
+    @property
+    def needs_whole_videos(self) -> bool:
+        """Whether a prior is for a whole video: exchange files, and the poses of a moving camera."""
+        sources = (self.priors.depth, self.priors.masks, self.priors.tracks, self.camera.poses)
+        return self.camera.poses == "sfm" or any(source.endswith(".npz") for source in sources)
+
 
 @dataclass
 class AugmentConfig(Recipe):

@@ -10,7 +10,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 
 from lerobot_msdyn.config import Recipe
 from lerobot_msdyn.episode import View, read_episode
-from lerobot_msdyn.pipeline import FURTHER_STEPS, by_feature, new_pictures, reads_files, reconstruct
+from lerobot_msdyn.pipeline import FURTHER_STEPS, by_feature, new_pictures, reconstruct
 from lerobot_msdyn.shared import MAX_EPISODES
 from lerobot_msdyn.staging import stage_pictures
 
@@ -46,7 +46,7 @@ def measure_speeds(source: LeRobotDatasetMetadata, index: int, cameras: list[str
         priors=replace(recipe.priors, cache="off"),
     )
     views = episode.views
-    if not reads_files(recipe):  # a file is for the whole episode
+    if not recipe.needs_whole_videos:
         views = {key: _middle(view) for key, view in views.items()}
     prepare_s = step_s = render_s = 0.0
     for key, part in views.items():

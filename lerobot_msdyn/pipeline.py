@@ -14,7 +14,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from torch import Tensor
 
 from lerobot_msdyn.background import empty_scene
-from lerobot_msdyn.cameras import CameraTrack, joined
+from lerobot_msdyn.cameras import CameraTrack, concatenated
 from lerobot_msdyn.config import Recipe, SceneConfig
 from lerobot_msdyn.episode import View, depth_key_of, read_episode, shrink
 from lerobot_msdyn.errors import EpisodeError
@@ -173,7 +173,8 @@ def reconstruct(
     `others`, `episode` and `key` are those of `estimate_priors`.
 
     Long videos are cut into windows, each with priors and a scene of its own, so that memory beyond the video itself
-    is that of one window. Windows share a background as episodes do.
+    is that of one window. Windows share a background as episodes do. The last arguments are those of
+    `estimate_priors`.
     """
     windows = _windows(view, recipe)
     if len(windows) > 1 and not backgrounds and recipe.scene.shared_background:
@@ -198,26 +199,20 @@ def reconstruct(
         fitted.append(_fit_window(shrink(window, recipe.fit.max_width), recipe, within, backgrounds, priors_of))
     results, known, distances, cameras = zip(*fitted, strict=True)
     starts = tuple(start for start, _ in windows)
-    camera = joined(cameras).resized(view.camera.width, view.camera.height)
+    camera = concatenated(cameras).resized(view.camera.width, view.camera.height)
     return Reconstruction(results, starts, known[0].metric, known[0].provenance, camera, distances[0])
 
 
 def _windows(view: View, recipe: Recipe) -> list[tuple[int, View]]:
     """First frames and parts of a video, of about equal length; priors from a file are for the whole video."""
     frames = len(view.rgb)
-    count = 1 if reads_files(recipe) else -(-frames // recipe.fit.window_frames)
+    count = 1 if recipe.needs_whole_videos else -(-frames // recipe.fit.window_frames)
     bounds = [round(i * frames / count) for i in range(count + 1)]
     parts = []
     for start, end in itertools.pairwise(bounds):
         depth = None if view.depth is None else view.depth[start:end]
         parts.append((start, View(view.rgb[start:end], view.camera.select(slice(start, end)), depth, view.depth_range)))
     return parts
-
-
-def reads_files(recipe: Recipe) -> bool:
-    """Whether a prior comes from an exchange file."""
-    sources = (recipe.priors.depth, recipe.priors.masks, recipe.priors.tracks, recipe.camera.poses)
-    return any(source.endswith(".npz") for source in sources)
 
 
 def _fit_window(
@@ -233,6 +228,8 @@ def _fit_window(
         shared = next((background for background in backgrounds if background.fits(view)), None)
         priors = priors_of(view, elsewhere=None if shared is None else shared.frames)
         view = replace(view, camera=priors.camera or view.camera)
+        if shared is not None and not shared.fits(view):  # another camera than was assumed at first
+            shared = None
         if not view.camera.is_static:
             logger.warning("the camera moves, but the empty scene is built as if it were fixed: expect blur")
         if priors.provenance["depth"]["provider"] not in SHARP_DEPTH:

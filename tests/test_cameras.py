@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from lerobot_msdyn.cameras import intrinsics_from_fov, joined, read_calibration, static_camera
+from lerobot_msdyn.cameras import concatenated, intrinsics_from_fov, read_calibration, static_camera
 from lerobot_msdyn.errors import PriorError
 
 K = [[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]
@@ -31,7 +31,7 @@ def test_parts_of_a_track_make_the_track() -> None:
     poses = torch.eye(4).repeat(5, 1, 1)
     poses[:, 0, 3] = torch.arange(5.0)
     track = replace(static_camera(torch.tensor(K), 5, 640, 480), world_from_camera=poses)
-    again = joined([track.select(slice(0, 2)), track.select(slice(2, 5))])
+    again = concatenated([track.select(slice(0, 2)), track.select(slice(2, 5))])
     assert torch.equal(again.world_from_camera, poses)
     assert (len(again), again.width, again.height) == (5, 640, 480)
 
