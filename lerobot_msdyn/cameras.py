@@ -52,11 +52,10 @@ class CameraTrack:
 
 
 def concatenated(parts: Sequence[CameraTrack]) -> CameraTrack:
-    """One track of several that follow each other in time."""
+    """One camera's tracks over consecutive times, as one."""
+    intrinsics = torch.cat([part.intrinsics for part in parts])
     return replace(
-        parts[0],
-        intrinsics=torch.cat([part.intrinsics for part in parts]),
-        world_from_camera=torch.cat([part.world_from_camera for part in parts]),
+        parts[0], intrinsics=intrinsics, world_from_camera=torch.cat([part.world_from_camera for part in parts])
     )
 
 

@@ -40,17 +40,24 @@ def measure_speeds(source: LeRobotDatasetMetadata, index: int, cameras: list[str
     episode = read_episode(source, index, cameras, recipe.camera, recorded_depth=recipe.priors.depth != "plane")
     frames = len(episode.time)
     read_s = (time.perf_counter() - start) / frames
-    short = replace(recipe, fit=replace(recipe.fit, steps=PROBE_STEPS, held_out_frames=0))
+    short = replace(
+        recipe,
+        fit=replace(recipe.fit, steps=PROBE_STEPS, held_out_frames=0),
+        priors=replace(recipe.priors, cache="off"),
+    )
+    views = episode.views
+    if not recipe.needs_whole_videos:
+        views = {key: _middle(view) for key, view in views.items()}
     prepare_s = step_s = render_s = 0.0
-    for key, view in episode.views.items():
-        part = view if recipe.needs_whole_videos else _middle(view)
+    for key, part in views.items():
         ticks: list[float] = []
 
         def tick(share: float, to: list[float] = ticks) -> None:
             to.append(time.perf_counter())
 
         start = time.perf_counter()
-        scene = reconstruct(part, short, tick)
+        others = [other for name, other in views.items() if name != key]
+        scene = reconstruct(part, short, tick, others=others, episode=index, key=key)
         prepare_s += (time.perf_counter() - start - scene.seconds) / len(part.rgb)
         steps = [
             after - before for before, after in zip(ticks[WARM_UP_STEPS:], ticks[WARM_UP_STEPS + 1 :], strict=False)

@@ -1,6 +1,7 @@
 """The whole flow on one screen: an episode in, a scene per camera, new episodes out."""
 
 import contextlib
+import functools
 import itertools
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,7 +16,6 @@ from torch import Tensor
 from lerobot_msdyn.background import empty_scene
 from lerobot_msdyn.cameras import CameraTrack, concatenated
 from lerobot_msdyn.config import Recipe, SceneConfig
-from lerobot_msdyn.depth_edges import sharpened
 from lerobot_msdyn.episode import View, depth_key_of, read_episode, shrink
 from lerobot_msdyn.errors import EpisodeError
 from lerobot_msdyn.fitting import FitResult, fit
@@ -37,7 +37,8 @@ from lerobot_msdyn.write import NewEpisode, OutputDataset
 
 logger = logging.getLogger(__name__)
 
-ROUGH_BORDER_PX = 2  # with depth from a file: from the border of a mask ...
+SHARP_DEPTH = ("recorded", "plane")  # providers whose depth has sharp edges and agrees between frames
+ROUGH_BORDER_PX = 2  # with the others' depth: from the border of a mask ...
 ROUGH_FRAMES = 6  # ... and so few frames are gathered, whose depths disagree
 FURTHER_STEPS = 0.6  # share of the fit's steps that suffices where the static set has been fitted already
 
@@ -52,7 +53,7 @@ class Reconstruction:
     results: tuple[FitResult, ...]
     starts: tuple[int, ...]  # first frame of each window
     metric: bool  # whether depth is in true metres
-    provenance: dict[str, dict[str, str]]  # prior -> provider, why, model; of the first window
+    provenance: dict[str, dict[str, str]]  # prior -> provider, why, model and licence, of the first window
     camera: CameraTrack  # at the size of the recorded video
     distance: float  # m, to the look-at point
 
@@ -131,13 +132,12 @@ def augment_episode(
     scenes = {}
     for key, view in episode.views.items():
         progress(f"episode {index}: fitting {key}", 0.0)
-        others = [other for name, other in episode.views.items() if name != key]
         scenes[key] = reconstruct(
             view,
             recipe,
             lambda share: progress("", 0.5 * share / len(cameras)),
             (backgrounds or {}).get(key, []),
-            others=others,
+            others=[other for name, other in episode.views.items() if name != key],
             episode=index,
             key=key,
         )
@@ -170,6 +170,8 @@ def reconstruct(
 ) -> Reconstruction:
     """Priors, initial scene and fit of one camera's video; the first of the shared backgrounds that fits is used.
 
+    `others`, `episode` and `key` are those of `estimate_priors`.
+
     Long videos are cut into windows, each with priors and a scene of its own, so that memory beyond the video itself
     is that of one window. Windows share a background as episodes do. The last arguments are those of
     `estimate_priors`.
@@ -185,23 +187,24 @@ def reconstruct(
         def within(share: float, done: int = number) -> object:
             return progress((done + share) / len(windows))
 
-        def priors_of(small: View, now: int = number) -> Priors:
-            here = [other[now] for other in beside]
-            return estimate_priors(
-                small, recipe.priors, recipe.camera, others=here, episode=episode, key=key, device=recipe.device
-            )
-
+        priors_of = functools.partial(
+            estimate_priors,
+            config=recipe.priors,
+            camera=recipe.camera,
+            others=[parts[number] for parts in beside],
+            episode=episode,
+            key=key,
+            device=recipe.device,
+        )
         fitted.append(_fit_window(shrink(window, recipe.fit.max_width), recipe, within, backgrounds, priors_of))
-    results, known, distances = zip(*fitted, strict=True)
+    results, known, distances, cameras = zip(*fitted, strict=True)
     starts = tuple(start for start, _ in windows)
-    camera = view.camera
-    if all(priors.camera is not None for priors in known):
-        camera = concatenated([priors.camera for priors in known]).resized(camera.width, camera.height)
+    camera = concatenated(cameras).resized(view.camera.width, view.camera.height)
     return Reconstruction(results, starts, known[0].metric, known[0].provenance, camera, distances[0])
 
 
 def _windows(view: View, recipe: Recipe) -> list[tuple[int, View]]:
-    """First frames and parts of a video, of about equal length; what is not estimated per frame needs it whole."""
+    """First frames and parts of a video, of about equal length; priors from a file are for the whole video."""
     frames = len(view.rgb)
     count = 1 if recipe.needs_whole_videos else -(-frames // recipe.fit.window_frames)
     bounds = [round(i * frames / count) for i in range(count + 1)]
@@ -217,20 +220,21 @@ def _fit_window(
     recipe: Recipe,
     progress: Callable[[float], object],
     backgrounds: Sequence[SharedBackground],
-    priors_of: Callable[[View], Priors],
-) -> tuple[FitResult, Priors, float]:
-    """A fitted scene of one window at the size at which it is fitted, its priors, and its look-at distance (m)."""
+    priors_of: Callable[..., Priors],
+) -> tuple[FitResult, Priors, float, CameraTrack]:
+    """A fitted scene of one window at the size at which it is fitted, its priors, look-at distance (m) and camera."""
     steps, settings = recipe.fit.steps, recipe.scene
     with _one_torch_thread():
-        priors = priors_of(view)
+        shared = next((background for background in backgrounds if background.fits(view)), None)
+        priors = priors_of(view, elsewhere=None if shared is None else shared.frames)
         view = replace(view, camera=priors.camera or view.camera)
+        if shared is not None and not shared.fits(view):  # another camera than was assumed at first
+            shared = None
         if not view.camera.is_static:
             logger.warning("the camera moves, but the empty scene is built as if it were fixed: expect blur")
-        if recipe.priors.depth.endswith(".npz"):
-            priors = replace(priors, depth=sharpened(priors.depth))
+        if priors.provenance["depth"]["provider"] not in SHARP_DEPTH:
             settings = _for_rough_depth(settings)
         empty = empty_scene(view.rgb, priors.depth, priors.instances)
-        shared = next((background for background in backgrounds if background.fits(view)), None)
         if shared is not None:
             empty = completed(empty, shared.empty)
         priors = replace(priors, empty=empty.rgb)
@@ -248,7 +252,7 @@ def _fit_window(
         seed=recipe.seed,
         progress=lambda done: progress(done / steps),
     )
-    return result, priors, distance
+    return result, priors, distance, view.camera
 
 
 def _for_rough_depth(scene: SceneConfig) -> SceneConfig:

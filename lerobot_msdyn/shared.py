@@ -14,7 +14,7 @@ from torch import Tensor
 from lerobot_msdyn.background import MARGIN_PX, EmptyScene, empty_scene
 from lerobot_msdyn.cameras import CameraTrack
 from lerobot_msdyn.episode import View
-from lerobot_msdyn.priors.change import Reference
+from lerobot_msdyn.priors.change import changes
 from lerobot_msdyn.priors.edges import clean_recorded_depth
 from lerobot_msdyn.priors.masks import temporal_median
 from lerobot_msdyn.scene import Gaussians, rgb_to_sh
@@ -36,6 +36,7 @@ class SharedBackground:
 
     empty: EmptyScene
     camera: CameraTrack  # of one frame
+    frames: UInt8[Tensor, "m h w 3"]  # those of all episodes that were looked at
     static: Gaussians | None = None  # fitted to it, a Gaussian per pixel of the grid of `background_gaussians`
 
     def fits(self, view: View) -> bool:
@@ -67,7 +68,12 @@ def share_backgrounds(views: list[View]) -> list[SharedBackground]:
         else:
             groups.append([view])
             pictures.append(picture)
-    return [SharedBackground(_pooled(group), group[0].camera.select([0])) for group in groups if len(group) > 1]
+    return [_shared(group) for group in groups if len(group) > 1]
+
+
+def _shared(views: list[View]) -> SharedBackground:
+    frames = torch.cat([view.rgb for view in views])
+    return SharedBackground(_pooled(views, frames), views[0].camera.select([0]), frames)
 
 
 def few_frames(view: View) -> View:
@@ -160,12 +166,10 @@ def shift_px(picture: UInt8[ndarray, "h w 3"], other: UInt8[ndarray, "i j 3"]) -
     return float(np.hypot(dx, dy))
 
 
-def _pooled(views: list[View]) -> EmptyScene:
+def _pooled(views: list[View], rgb: UInt8[Tensor, "m h w 3"]) -> EmptyScene:
     """The empty scene over some frames of every video; what differs from the median of all of them moves."""
-    rgb = torch.cat([view.rgb for view in views])
     median, noise = temporal_median(rgb)
-    reference = Reference(median.numpy(), noise.numpy())
-    moving = torch.from_numpy(np.stack([reference.change(frame) > 0 for frame in rgb.numpy()]).astype(np.uint8))
+    moving = torch.from_numpy(changes(rgb.numpy(), median.numpy(), noise.numpy()).astype(np.uint8))
     depths: list[Float[Tensor, "t h w"]] = []
     for view in views:
         unknown = torch.zeros(view.rgb.shape[:3])

@@ -2,12 +2,13 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
-from lerobot_msdyn.cameras import intrinsics_from_fov, read_calibration, static_camera
+from lerobot_msdyn.cameras import concatenated, intrinsics_from_fov, read_calibration, static_camera
 from lerobot_msdyn.errors import PriorError
 
 K = [[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]
@@ -24,6 +25,15 @@ def test_field_of_view() -> None:
     intrinsics = intrinsics_from_fov(640, 480, 90.0)
     assert float(intrinsics[0, 0]) == pytest.approx(320)
     assert math.degrees(2 * math.atan(320 / float(intrinsics[0, 0]))) == pytest.approx(90)
+
+
+def test_parts_of_a_track_make_the_track() -> None:
+    poses = torch.eye(4).repeat(5, 1, 1)
+    poses[:, 0, 3] = torch.arange(5.0)
+    track = replace(static_camera(torch.tensor(K), 5, 640, 480), world_from_camera=poses)
+    again = concatenated([track.select(slice(0, 2)), track.select(slice(2, 5))])
+    assert torch.equal(again.world_from_camera, poses)
+    assert (len(again), again.width, again.height) == (5, 640, 480)
 
 
 def test_static_camera_stands_still() -> None:

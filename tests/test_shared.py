@@ -35,6 +35,7 @@ def test_what_differs_between_episodes_is_no_background() -> None:
     (shared,) = share_backgrounds([episode(column, wall) for column in (4, 20, 36, 52)])
     assert (shared.empty.rgb.numpy() == wall).mean() > 0.99
     assert (shared.empty.depth == 2).all()
+    assert shared.frames.shape == (4 * FRAMES, HEIGHT, WIDTH, 3)
     assert shared.fits(episode(30, wall))
 
 

@@ -2,7 +2,7 @@
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Int, UInt8
+from jaxtyping import Bool, Float32, Int, UInt8
 from numpy import ndarray
 
 _NOISE_CEILING = 2.0  # times the image's median noise: a pixel that is often covered only looks noisy
@@ -65,6 +65,14 @@ class Reference:
         even = _mean(np.abs(mean - cv2.medianBlur(mean, _EVEN_WINDOW)), _EVEN_WINDOW)
         alike = self._texture.correlation(_Texture(lab[..., 0]))
         return np.log(tint + 0.02), np.log(colour + 1), np.log(even + 0.01), alike, np.log(distance + 1), mean.clip(0)
+
+
+def changes(
+    frames: UInt8[ndarray, "t h w 3"], reference: UInt8[ndarray, "h w 3"], noise: Float32[ndarray, "h w"]
+) -> Bool[ndarray, "t h w"]:
+    """Pixels of each frame that show something else than the reference does, neighbours deciding together."""
+    before = Reference(reference, noise)
+    return np.stack([along_edges(before.change(frame), frame) > 0 for frame in frames])
 
 
 class _Texture:

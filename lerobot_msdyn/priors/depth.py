@@ -1,4 +1,4 @@
-"""Depth without a sensor or learned weights: a table plane on which everything stands; and the empty scene's depth."""
+"""Depth without a sensor or learned weights: a table plane on which everything stands."""
 
 import math
 
@@ -10,7 +10,6 @@ from torch import Tensor
 _WALL = 3.0  # distance of the wall behind the table, in distances to the table at the image's centre
 _LOWEST = 0.98  # quantile of an instance's rows where it touches the table; the very last ones may be stray pixels
 _SMOOTH_FRAMES = 9  # of the temporal smoothing of an instance's distance
-_STATIC_SAMPLES = 60  # frames over which a static median is taken
 
 
 def table_plane_depth(
@@ -46,19 +45,3 @@ def _standing(mask: Bool[Tensor, "t h w"], rows: Float[Tensor, " h"]) -> Float[T
     padded = torch.from_numpy(np.pad(nearest, 2 * reach, mode="edge"))
     median = padded.unfold(0, _SMOOTH_FRAMES, 1).median(dim=-1).values
     return median.unfold(0, _SMOOTH_FRAMES, 1).mean(dim=-1)
-
-
-def static_depth(depth: Float[Tensor, "t h w"], instances: UInt8[Tensor, "t h w"]) -> Float[Tensor, "h w"]:
-    """Depth (m) of the empty scene: per pixel the median over frames in which nothing moves there; 0 where never."""
-    frames = len(depth)
-    sample = torch.linspace(0, frames - 1, min(frames, _STATIC_SAMPLES)).round().long()
-    empty = _static_median(depth[sample].flatten(1), instances[sample].flatten(1))
-    missing = empty == 0
-    if frames > len(sample) and missing.any():
-        empty[missing] = _static_median(depth.flatten(1)[:, missing], instances.flatten(1)[:, missing])
-    return empty.reshape(depth.shape[1:])
-
-
-def _static_median(depth: Float[Tensor, "t p"], instances: UInt8[Tensor, "t p"]) -> Float[Tensor, " p"]:
-    usable = (instances == 0) & (depth > 0)
-    return torch.where(usable, depth, torch.nan).nanmedian(dim=0).values.nan_to_num(0.0)

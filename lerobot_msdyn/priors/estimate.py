@@ -3,6 +3,9 @@
 import logging
 from collections.abc import Sequence
 
+from jaxtyping import UInt8
+from torch import Tensor
+
 from lerobot_msdyn.config import CameraConfig, PriorsConfig
 from lerobot_msdyn.episode import View
 from lerobot_msdyn.priors.cache import open_cache
@@ -24,6 +27,7 @@ def estimate_priors(
     camera: CameraConfig,
     *,
     others: Sequence[View] = (),
+    elsewhere: UInt8[Tensor, "m h w 3"] | None = None,
     episode: int | None = None,
     key: str | None = None,
     device: str = "auto",
@@ -35,6 +39,7 @@ def estimate_priors(
         config: the providers.
         camera: what is assumed about the camera.
         others: videos of the same moments by other cameras, for stereo.
+        elsewhere: frames of other episodes of the same fixed camera, which show the masks what this one hides.
         episode: index of the episode, by which exchange files are found and checked.
         key: feature key of the camera, likewise.
         device: auto, cpu or cuda, for learned providers.
@@ -42,9 +47,8 @@ def estimate_priors(
     Raises:
         PriorError: a provider was asked for by name and cannot be had, or an exchange file cannot be used.
     """
-    request = Request(
-        view, config, camera, open_cache(config.cache, view.rgb), others, episode, key, torch_device(device)
-    )
+    cache = open_cache(config.cache, view.rgb)
+    request = Request(view, config, camera, cache, others, elsewhere, episode, key, torch_device(device))
     instances, masks_from = provide_masks(request)
     request, camera_from = provide_camera(request, instances)
     (depth, metric), depth_from = provide_depth(request, instances)
@@ -52,7 +56,7 @@ def estimate_priors(
     pinhole = request.view.camera
     if camera.fov_search:
         pinhole, camera_from = with_searched_fov(pinhole, tracks, depth, depth_from.provider)
-    empty = empty_scene(view.rgb, instances, temporal_median(view.rgb)[0])
+    empty = empty_scene(view.rgb, instances, temporal_median(view.rgb, elsewhere)[0])
     origins = {"camera": camera_from, "masks": masks_from, "depth": depth_from, "tracks": tracks_from}
     found = {"masks": f", {int(instances.max())} instances", "tracks": f", {len(tracks)} tracks"}
     for prior, origin in origins.items():

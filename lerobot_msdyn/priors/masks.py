@@ -19,7 +19,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.priors.boxes import box_about
-from lerobot_msdyn.priors.change import Colours, Reference, along_edges, to_lab
+from lerobot_msdyn.priors.change import Colours, Reference, along_edges, changes, to_lab
 from lerobot_msdyn.priors.ghosts import without_ghosts
 from lerobot_msdyn.priors.linking import numbered
 from lerobot_msdyn.priors.medians import median_where
@@ -128,8 +128,7 @@ def _moving_pixels(
     noise: Float32[ndarray, "h w"],
 ) -> Bool[ndarray, "t h w"]:
     """Pixels that show something that moves at some time of the clip, even while it rests."""
-    reference = Reference(median, noise)
-    changed = np.stack([along_edges(reference.change(frame), frame) > 0 for frame in frames])
+    changed = changes(frames, median, noise)
     region = _ever_changing(changed)
     if not region.any():
         return changed & False

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from lerobot_msdyn.depth_edges import sharpened
 from lerobot_msdyn.errors import PriorError
 from lerobot_msdyn.priors.align import align_disparity, align_scale
 from lerobot_msdyn.priors.cache import digest_of
@@ -129,7 +130,7 @@ def _learned(request: Request, instances: UInt8[Tensor, "t h w"], provider: str,
     if (kind == "metric") != (provider == "depth_anything_metric"):
         raise PriorError(f"priors.depth is {provider!r}, but {model.name} predicts {kind.replace('_', ' ')}")
     depth, true_metres, how = _scaled(request, instances, values, kind, file=False)
-    return (without_flying_pixels(depth), true_metres), Origin.learned(provider, model, f"{why}; {how}")
+    return (_clean(depth), true_metres), Origin.learned(provider, model, f"{why}; {how}")
 
 
 def _from_file(request: Request, instances: UInt8[Tensor, "t h w"], pattern: str) -> Found:
@@ -140,9 +141,12 @@ def _from_file(request: Request, instances: UInt8[Tensor, "t h w"], pattern: str
     depth, true_metres, how = _scaled(request, instances, values, content.depth_kind, file=True)
     origin = file_origin(content.provenance.get("depth"), pattern)
     why = f"{origin.why}, {content.depth_kind}; {how}"
-    return (without_flying_pixels(depth), true_metres), Origin(
-        "file", why, origin.model, origin.revision, origin.licence
-    )
+    return (_clean(depth), true_metres), Origin("file", why, origin.model, origin.revision, origin.licence)
+
+
+def _clean(depth: Float[Tensor, "t h w"]) -> Float[Tensor, "t h w"]:
+    """Depth (m) without blurred edges: what is near a surface is put on it, and the rest becomes unknown."""
+    return without_flying_pixels(sharpened(depth))
 
 
 def _scaled(

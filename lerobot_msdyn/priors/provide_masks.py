@@ -7,6 +7,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from lerobot_msdyn.errors import PriorError
+from lerobot_msdyn.priors.cache import digest_of
 from lerobot_msdyn.priors.hub import LocalModel, demand_model, find_model, has_companion, has_library
 from lerobot_msdyn.priors.masks import moving_instances, temporal_median
 from lerobot_msdyn.priors.request import FILE, Candidate, Request, first_that_works
@@ -53,12 +54,13 @@ def _candidates(request: Request) -> list[Candidate[Masks]]:
 
 def change(request: Request, why: str) -> tuple[Masks, Origin]:
     """Weights-free masks."""
-    rgb = request.view.rgb
+    rgb, elsewhere = request.view.rgb, request.elsewhere
 
     def compute() -> dict:
-        return {"masks": moving_instances(rgb, *temporal_median(rgb)).numpy()}
+        return {"masks": moving_instances(rgb, *temporal_median(rgb, elsewhere), elsewhere).numpy()}
 
-    found = request.cache.get("masks", "change", {}, compute)
+    settings = {} if elsewhere is None else {"elsewhere": digest_of(elsewhere)}
+    found = request.cache.get("masks", "change", settings, compute)
     return torch.from_numpy(found["masks"]), Origin("change", why)
 
 

@@ -4,6 +4,9 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+from jaxtyping import UInt8
+from torch import Tensor
+
 from lerobot_msdyn.config import CameraConfig, PriorsConfig
 from lerobot_msdyn.episode import View
 from lerobot_msdyn.errors import PriorError
@@ -25,6 +28,7 @@ class Request:
     camera: CameraConfig
     cache: PriorCache
     others: Sequence[View] = ()  # of the same moments, by other cameras
+    elsewhere: UInt8[Tensor, "m h w 3"] | None = None  # frames of other episodes of the same fixed camera
     episode: int | None = None
     key: str | None = None  # of the camera's feature
     device: str = "cpu"  # on which networks run

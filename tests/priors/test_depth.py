@@ -1,11 +1,11 @@
-"""Depth: the table plane, the empty scene."""
+"""Depth: the table plane."""
 
 import math
 
 import pytest
 import torch
 
-from lerobot_msdyn.priors.depth import static_depth, table_plane_depth
+from lerobot_msdyn.priors.depth import table_plane_depth
 
 K = torch.tensor([[50.0, 0.0, 32.0], [0.0, 50.0, 24.0], [0.0, 0.0, 1.0]])
 
@@ -30,23 +30,3 @@ def test_a_moving_thing_stands_on_the_table() -> None:
     assert depth[0, 12, 25].item() == pytest.approx(foot, rel=0.02)
     assert depth[0, 39, 25] == depth[0, 12, 25]
     torch.testing.assert_close(depth[7], empty[7])
-
-
-def test_the_empty_scene_is_the_median_of_what_is_seen_of_it() -> None:
-    depth = torch.full((9, 4, 4), 2.0)
-    instances = torch.zeros(9, 4, 4, dtype=torch.uint8)
-    depth[:8, 0, 0], instances[:8, 0, 0] = 1.0, 1  # hidden but once
-    depth[:6, 1, 1] = 0.0  # not measured
-    instances[:, 2, 2] = 3  # always hidden
-    depth[0, 3, 3] = 5.0  # an outlier
-    expected = torch.full((4, 4), 2.0)
-    expected[2, 2] = 0
-    torch.testing.assert_close(static_depth(depth, instances), expected)
-
-
-def test_a_pixel_that_the_sample_misses_is_looked_up_in_all_frames() -> None:
-    instances = torch.ones(200, 2, 2, dtype=torch.uint8)
-    instances[101] = 0
-    depth = torch.full((200, 2, 2), 1.0)
-    depth[101] = 4.0
-    torch.testing.assert_close(static_depth(depth, instances), torch.full((2, 2), 4.0))

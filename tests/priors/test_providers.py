@@ -37,6 +37,17 @@ def estimate(view: View, camera: CameraConfig | None = None, **config: object) -
     return estimate_priors(view, PriorsConfig(**config), camera or CameraConfig(), episode=0, key="front")  # type: ignore[arg-type]
 
 
+def test_other_episodes_show_the_masks_what_this_one_hides(view: View, sliding) -> None:
+    resting = View(view.rgb[:1].expand(FRAMES, -1, -1, -1).contiguous(), view.camera)
+    assert not estimate(resting).instances.any()
+    empty = torch.from_numpy(sliding.empty.round().astype(np.uint8))
+    elsewhere = empty.expand(3 * FRAMES, -1, -1, -1).contiguous()
+    found = estimate_priors(resting, PriorsConfig(), CameraConfig(), elsewhere=elsewhere).instances > 0
+    mask = sliding.mask[6]
+    assert (found[0] & mask).sum() > 0.9 * mask.sum()
+    assert found[0].sum() < 2 * mask.sum()
+
+
 def test_auto_takes_what_is_at_hand_and_says_why(view: View, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO):
         priors = estimate(view)
