@@ -170,8 +170,6 @@ def reconstruct(
 ) -> Reconstruction:
     """Priors, initial scene and fit of one camera's video; the first of the shared backgrounds that fits is used.
 
-    `others`, `episode` and `key` are those of `estimate_priors`.
-
     Long videos are cut into windows, each with priors and a scene of its own, so that memory beyond the video itself
     is that of one window. Windows share a background as episodes do. The last arguments are those of
     `estimate_priors`.
