@@ -29,10 +29,10 @@ _LEAST_GRAIN = 12  # tracks of a grain
 _FOLDS = 3  # each third of the tracks judges a level that was fitted to the others
 _LEAST_JUDGES = 8  # tracks, without which a level is refused
 _CANONICAL_REACH = 4  # frames about the canonical one that do not judge
-_QUERY_FRAMES = 4  # spread over the clip, from which judges are predicted ...
+_QUERY_FRAMES = 8  # spread over the clip, from which judges are predicted ...
 _QUERY_REACH = 4  # ... in frames farther away than this ...
 _JUDGED_FRAMES = 60  # ... of so many
-_TRIM = 0.1  # of the judges at either end do not count: tracks that slipped, or are in a wrong part
+_WORTH = 0.01  # of the error, that a level must take away
 _VISIBLE_PX = 0.3  # that a level must explain: less is not seen, and the drift of the tracks themselves
 _SURE = 3.0  # standard errors that the gain must be: some ten pairs of part and level are judged per episode
 
@@ -185,16 +185,14 @@ def _prediction(
 def _proven(
     error: Float[Tensor, " n"], gain: Float[Tensor, " n"], part: Int[Tensor, " n"], visible_m: float
 ) -> Bool[Tensor, " p"]:
-    """Parts in which a level explains a visible motion, surely, and of more than a few tracks."""
+    """Parts in which a level explains a visible motion, surely, and enough to matter."""
     proven = torch.zeros(int(part.max()) + 1 if len(part) else 0, dtype=torch.bool)
     for label in part.unique().tolist():
-        judges = ((part == label) & gain.isfinite()).nonzero()[:, 0]
-        if len(judges) < _LEAST_JUDGES:
-            continue
-        trimmed = int(_TRIM * len(judges))
-        judges = judges[gain[judges].argsort()[trimmed : len(judges) - trimmed]]
+        judges = (part == label) & gain.isfinite()
         before, gains = error[judges], gain[judges]
+        if len(gains) < _LEAST_JUDGES:
+            continue
         explained = (before.square() - (before - gains).square()).mean()
         sure = gains.mean() > _SURE * gains.std() / len(gains) ** 0.5
-        proven[label] = bool(sure & (explained > visible_m**2))
+        proven[label] = bool(sure & (gains.mean() > _WORTH * before.mean()) & (explained > visible_m**2))
     return proven
