@@ -19,12 +19,14 @@ from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.priors.boxes import box_about
+from lerobot_msdyn.priors.camera_motion import SWAY_PX, camera_motion_px
 from lerobot_msdyn.priors.change import Colours, Reference, along_edges, changes, to_lab
 from lerobot_msdyn.priors.ghosts import without_ghosts
 from lerobot_msdyn.priors.linking import numbered
 from lerobot_msdyn.priors.medians import median_where
 from lerobot_msdyn.priors.stabilise import camera_sway, to_frames, to_reference
 from lerobot_msdyn.priors.votes import AUDIBLE, votes
+from lerobot_msdyn.priors.wandering import residual_odds
 
 _MAX_WIDTH = 320  # px
 _MEDIAN_SAMPLES = 60  # frames over which medians are taken
@@ -75,7 +77,8 @@ def moving_instances(
 
     At most 8 instances, each followed by optical flow so that it keeps its number when it touches another. `median`
     and `noise` are those of `temporal_median`; `others` are frames of other episodes of the same fixed camera, which
-    show places that this one hides. Videos wider than 320 px are looked at in that width.
+    show places that this one hides. Before a camera that moves more than it sways (`camera_motion`), what differs from
+    the background of the neighbouring frames moves (`wandering`). Videos wider than 320 px are looked at in that width.
     """
     height, width = noise.shape
     size = (min(width, _MAX_WIDTH), max(1, round(height * min(1.0, _MAX_WIDTH / width))))
@@ -88,6 +91,9 @@ def moving_instances(
         small(median[None].cpu().numpy()),
         small(noise[None].numpy()),
     )
+    if camera_motion_px(torch.from_numpy(frames)) > SWAY_PX:
+        moving = np.stack([_tidy(odds > 0) for odds in residual_odds(frames)])
+        return torch.from_numpy(_at_size(numbered(frames, moving), (width, height)))
     elsewhere = frames[:0] if others is None else small(_spread(others.cpu().numpy(), _MEDIAN_SAMPLES))
     sway = camera_sway(np.concatenate((frames, elsewhere)), empty)
     if sway is not None:
@@ -97,9 +103,14 @@ def moving_instances(
     numbers = numbered(frames, _moving_pixels(frames, elsewhere, empty, spread))
     if sway is not None:
         numbers = to_frames(numbers, sway[: len(frames)])
-    if size == (width, height):
-        return torch.from_numpy(numbers)
-    return torch.from_numpy(np.stack([_enlarged(frame, (width, height)) for frame in numbers]))
+    return torch.from_numpy(_at_size(numbers, (width, height)))
+
+
+def _at_size(numbers: UInt8[ndarray, "t h w"], size: tuple[int, int]) -> UInt8[ndarray, "t H W"]:
+    """Numbered regions of all frames at a size (width, height)."""
+    if size == (numbers.shape[2], numbers.shape[1]):
+        return numbers
+    return np.stack([_enlarged(frame, size) for frame in numbers])
 
 
 def _enlarged(numbers: UInt8[ndarray, "h w"], size: tuple[int, int]) -> UInt8[ndarray, "H W"]:
