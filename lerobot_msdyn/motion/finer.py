@@ -84,6 +84,9 @@ def add_level(
             error[fold == k], gain[fold == k] = judged
         kept = torch.zeros(len(found), dtype=torch.bool)
         kept[owner[_proven(error, gain, tracks.part, _VISIBLE_PX * seen.pixel_m)[tracks.part]]] = True
+        coarser = so_far.levels[-1]
+        if name == "grain" and isinstance(coarser, MotionLevel):  # where its primitive was refused, it refines nothing
+            kept &= coarser.active[found.parents.clamp(min=0)]
         found = replace(found, active=found.active & kept)
     return found, replace(tracks, positions=pull_back(found, indices, logits, tracks.positions), owner=owner)
 
