@@ -14,6 +14,7 @@ from lerobot_msdyn.config import MotionConfig, SceneConfig
 from lerobot_msdyn.episode import View
 from lerobot_msdyn.geometry import project, quaternion_multiply, transform_points
 from lerobot_msdyn.motion.initialise import SceneMotion, scene_motion
+from lerobot_msdyn.motion.register import register_parts
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.scene import DynamicScene, Gaussians, concatenate, isotropic
 
@@ -39,7 +40,7 @@ def initialise(
     if empty is None:
         empty = empty_scene(view.rgb, priors.depth, priors.instances)
     static = background_gaussians(empty.rgb, empty.depth, view.camera, scene.static_gaussians)
-    found = scene_motion(priors.tracks, priors.depth, view.camera, motion) if scene.moving_gaussians > 0 else None
+    found = _motion(view, priors, motion) if scene.moving_gaussians > 0 else None
     if found is None:
         moving = static.select(torch.zeros(0, dtype=torch.long))
         return DynamicScene(static, moving, (), (), (), len(view.rgb))
@@ -47,6 +48,16 @@ def initialise(
     if scene.isotropic:
         static, moving = isotropic(static), isotropic(moving)
     return DynamicScene(static, moving, found.levels, *found.bind(moving.means, part), len(view.rgb))
+
+
+def _motion(view: View, priors: Priors, config: MotionConfig) -> SceneMotion | None:
+    """Motion of everything that was tracked, its parts registered to what was recorded where depth is true."""
+
+    def register(motion: SceneMotion) -> SceneMotion:
+        return register_parts(motion, view.rgb, priors.depth, priors.instances, view.camera)
+
+    wanted = config.register and priors.metric
+    return scene_motion(priors.tracks, priors.depth, view.camera, config, register if wanted else None)
 
 
 def gather_moving(

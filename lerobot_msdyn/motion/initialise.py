@@ -1,5 +1,8 @@
 """From tracks to the motion of a scene: lift, canonical frame, rigid parts, then one level after the other."""
 
+from collections.abc import Callable
+from typing import cast
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -28,9 +31,15 @@ _CANONICAL_FRAMES = 2.0  # about the canonical one, over which a point is averag
 _MEAN_ROUNDS = 3  # of robust weights
 _OUTLIER = 3.0  # times the usual distance from the mean: half of the weight and more is lost
 
+Register = Callable[[SceneMotion], SceneMotion]  # improves the poses of the parts, before finer levels are built
+
 
 def scene_motion(
-    tracks: PointTracks, depth: Float[Tensor, "t h w"], camera: CameraTrack, config: MotionConfig
+    tracks: PointTracks,
+    depth: Float[Tensor, "t h w"],
+    camera: CameraTrack,
+    config: MotionConfig,
+    register: Register | None = None,
 ) -> SceneMotion | None:
     """Motion of everything that was tracked, or None where nothing was.
 
@@ -39,6 +48,7 @@ def scene_motion(
         depth: z-depth in m, 0 = unknown.
         camera: the camera that saw both.
         config: the levels.
+        register: improves the object level by what tracks do not tell.
     """
     xyz, valid = lift_tracks(tracks, depth, camera)
     kept = _longest(valid, tracks.instance)
@@ -47,10 +57,11 @@ def scene_motion(
     xyz, valid = xyz[kept], valid[kept]
     in_camera = transform_points(camera.camera_from_world, xyz.transpose(0, 1))[..., 2].T[valid]
     pixel_m = float(in_camera.median() / camera.intrinsics[0, 0, 0])
-    return motion_from_tracks(LiftedTracks(xyz, valid, tracks.confidence[kept], tracks.instance[kept], pixel_m), config)
+    lifted = LiftedTracks(xyz, valid, tracks.confidence[kept], tracks.instance[kept], pixel_m)
+    return motion_from_tracks(lifted, config, register)
 
 
-def motion_from_tracks(tracks: LiftedTracks, config: MotionConfig) -> SceneMotion:
+def motion_from_tracks(tracks: LiftedTracks, config: MotionConfig, register: Register | None = None) -> SceneMotion:
     """All levels of motion (the paper's section on initialisation; docs/method.md), from at least one track."""
     noise = position_noise(tracks.xyz, tracks.valid)
     canonical = canonical_frame(tracks.valid, tracks.instance)
@@ -66,6 +77,9 @@ def motion_from_tracks(tracks: LiftedTracks, config: MotionConfig) -> SceneMotio
         still_m=_STILL_PX * tracks.pixel_m,
         frames_per_knot=config.frames_per_knot.object,
     )
+    if register is not None and config.levels[0] == "object" and bool(objects.active.any()):
+        registered = register(SceneMotion(("object",), (objects,), canonical, points, part, tracks.instance))
+        objects, points = cast(MotionLevel, registered.levels[0]), registered.points
     weights = torch.where(tracks.valid, tracks.confidence.square(), 0.0)
     names, levels = _first_level(config, objects, points, tracks.xyz, weights, canonical, noise)
     positions = pull_back(objects, part[:, None], torch.zeros(len(part), 1), tracks.xyz)
