@@ -10,18 +10,20 @@ from dataclasses import replace
 import numpy as np
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
+from torch import Tensor
 
 from lerobot_msdyn.background import empty_scene
-from lerobot_msdyn.cameras import concatenated
-from lerobot_msdyn.config import Recipe, SceneConfig
+from lerobot_msdyn.bounds import NewCameras, new_cameras
+from lerobot_msdyn.cameras import concatenated, read_calibration
+from lerobot_msdyn.config import OtherCameraConfig, Recipe, SceneConfig
 from lerobot_msdyn.coverage import Evidence, evidence_of
 from lerobot_msdyn.episode import View, depth_key_of, read_episode, shrink
-from lerobot_msdyn.errors import EpisodeError
+from lerobot_msdyn.errors import ConfigError, EpisodeError
 from lerobot_msdyn.fitting import FitResult, fit
 from lerobot_msdyn.initialisation import initialise
-from lerobot_msdyn.perturbation import draw_offset, draw_rng, look_at_distance, perturb
+from lerobot_msdyn.perturbation import look_at_distance
 from lerobot_msdyn.priors import PointTracks, Priors, estimate_priors
-from lerobot_msdyn.provenance import SOURCE_VARIANT, Provenance
+from lerobot_msdyn.provenance import SOURCE_VARIANT, Provenance, camera_pose
 from lerobot_msdyn.shared import (
     MAX_EPISODES,
     SharedBackground,
@@ -30,7 +32,7 @@ from lerobot_msdyn.shared import (
     few_frames,
     share_backgrounds,
 )
-from lerobot_msdyn.views import Picture, Reconstruction, new_pictures
+from lerobot_msdyn.views import Picture, Reconstruction, UnseenMasks, new_pictures
 from lerobot_msdyn.write import NewEpisode, OutputDataset
 
 logger = logging.getLogger(__name__)
@@ -38,6 +40,7 @@ logger = logging.getLogger(__name__)
 SHARP_DEPTH = ("recorded", "plane")  # providers whose depth has sharp edges and agrees between frames
 ROUGH_BORDER_PX = 2  # with the others' depth: from the border of a mask ...
 ROUGH_FRAMES = 6  # ... and so few frames are gathered, whose depths disagree
+ATTEMPTS = 3  # draws of one new episode before it is given up
 FURTHER_STEPS = 0.6  # share of the fit's steps that suffices where the static set has been fitted already
 
 Backgrounds = Mapping[str, Sequence[SharedBackground]]  # by camera
@@ -115,20 +118,73 @@ def augment_episode(
             key=key,
         )
     priors = {key: scene.provenance for key, scene in scenes.items()}
+    other = _other_pose(recipe, index, episode.views[cameras[0]])
     new = []
     if recipe.include_source:
         new.append(NewEpisode(index, Provenance(source.repo_id, index, SOURCE_VARIANT, recipe.seed, {}, priors)))
     for variant in range(recipe.variants):
         progress(f"episode {index}: rendering variant {variant}", 0.0)
-        rng = draw_rng(recipe.seed, index, variant)
-        pictures, drawn = {}, {}
-        for key, scene in scenes.items():
-            offset, drawn[key] = draw_offset(recipe.perturbation, scene.distance, rng)
-            pictures[key] = new_pictures(scene, perturb(scene.camera, offset))
-        provenance = Provenance(source.repo_id, index, variant, recipe.seed, drawn, priors)
-        new.append(output.stage(index, variant, by_feature(source, pictures), provenance))
+        found = _accepted(scenes, recipe, index, variant, other)
+        if found is not None:
+            new.append(_staged(source, index, variant, recipe, output, scenes, found))
         progress("", 0.5 / recipe.variants)
     return new
+
+
+def _accepted(
+    scenes: Mapping[str, Reconstruction], recipe: Recipe, index: int, variant: int, other: Tensor | None
+) -> NewCameras | None:
+    """The cameras of one new episode, drawn again where they show too much that was never seen; None: given up."""
+    for attempt in range(ATTEMPTS):
+        found = new_cameras(scenes, recipe, index, variant, attempt, other)
+        if not found.rejected:
+            return found
+        logger.warning("episode %d variant %d, draw %d: rejected: %s", index, variant, attempt, found.rejected)
+    return None
+
+
+def _staged(
+    source: LeRobotDatasetMetadata,
+    index: int,
+    variant: int,
+    recipe: Recipe,
+    output: OutputDataset,
+    scenes: Mapping[str, Reconstruction],
+    found: NewCameras,
+) -> NewEpisode:
+    """One new episode, rendered and encoded."""
+    pictures = {key: new_pictures(scene, found.cameras[key], fill=recipe.fill) for key, scene in scenes.items()}
+    masks = UnseenMasks() if recipe.masks else None
+    if masks is not None:
+        pictures = {key: masks.kept(key, some) for key, some in pictures.items()}
+    provenance = Provenance(
+        source.repo_id,
+        index,
+        variant,
+        recipe.seed,
+        found.drawn,
+        {key: scene.provenance for key, scene in scenes.items()},
+        {key: camera_pose(scene.camera, found.cameras[key]) for key, scene in scenes.items()},
+    )
+    new = output.stage(index, variant, by_feature(source, pictures), provenance)
+    return new if masks is None else replace(new, masks=masks.arrays())
+
+
+def _other_pose(recipe: Recipe, index: int, view: View) -> Tensor | None:
+    """World from the camera that `other_camera` names."""
+    config = recipe.perturbation
+    if not isinstance(config, OtherCameraConfig):
+        return None
+    camera = None
+    if recipe.camera.calibration is not None:
+        height, width = view.rgb.shape[1:3]
+        camera = read_calibration(recipe.camera.calibration, config.camera, index, 1, width, height)
+    if camera is None:
+        raise ConfigError(
+            f"perturbation.camera is {config.camera!r}, which the calibration {recipe.camera.calibration} does not "
+            "name; expected a camera with K, R and t there (--camera.calibration FILE)"
+        )
+    return camera.world_from_camera[0]
 
 
 def reconstruct(
