@@ -44,7 +44,10 @@ def test_a_change_that_shows_too_much_is_shrunk(scenes: dict[str, Reconstruction
 
 
 def test_what_cannot_be_shrunk_is_rejected(scenes: dict[str, Reconstruction]) -> None:
-    assert "unseen" in new_cameras(scenes, recipe(max_unseen=0.0), 0, 0).rejected
+    back = [*torch.eye(4)[:2].flatten().tolist(), 0.0, 0.0, 1.0, 2.0]  # 2 m along the optical axis
+    assert (
+        "unseen" in new_cameras(scenes, recipe(max_unseen=0.0, perturbation=PosesConfig(poses=[back])), 0, 0).rejected
+    )
 
 
 def test_a_crop_shows_only_what_was_seen(scenes: dict[str, Reconstruction]) -> None:
