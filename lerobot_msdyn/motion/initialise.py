@@ -105,7 +105,8 @@ def motion_from_tracks(tracks: LiftedTracks, config: MotionConfig, recording: Re
 
 def _parts_of(motion: SceneMotion, tracks: LiftedTracks) -> Int[Tensor, " n"]:
     """Part of every track, by what is near it where it is seen; no part is left without tracks."""
-    votes = torch.zeros(len(tracks.xyz), len(motion.levels[0]))
+    count = len(cast(MotionLevel, motion.levels[0]))
+    votes = torch.zeros(len(tracks.xyz), count)
     at_canonical = torch.zeros(len(tracks.xyz), 3)
     seen = tracks.valid.cumsum(1)
     for share in torch.linspace(0, 1, _VOTING_FRAMES + 2)[1:-1].tolist():
@@ -115,7 +116,7 @@ def _parts_of(motion: SceneMotion, tracks: LiftedTracks) -> Int[Tensor, " n"]:
             at_canonical[rows], found = motion.to_canonical(tracks.xyz[rows, frame], frame, tracks.instance[rows])
             votes[rows, found] += 1
     part = votes.argmax(1)
-    for k in range(len(motion.levels[0])):
+    for k in range(count):
         own = motion.points[motion.part == k]
         if len(own) and not bool((part == k).any()):
             part[(at_canonical - own.mean(0)).norm(dim=-1).argmin()] = k

@@ -1,3 +1,4 @@
+# mypy: disable-error-code="no-untyped-def"
 """Compiled loops of the registration: points against what a frame shows, and Gauss-Newton steps of rigid parts.
 
 Everything is in the axes of the camera, in m. numba looks for changes in this file only.
@@ -61,10 +62,23 @@ def _surface(maps, t, row, column):
     height, width = maps.depth.shape[1:]
     left, right = max(column - REACH_PX, 0), min(column + REACH_PX, width - 1)
     up, down = max(row - REACH_PX, 0), min(row + REACH_PX, height - 1)
-    z_l, z_r, z_u, z_d = maps.depth[t, row, left], maps.depth[t, row, right], maps.depth[t, up, column], maps.depth[t, down, column]
+    z_l, z_r, z_u, z_d = (
+        maps.depth[t, row, left],
+        maps.depth[t, row, right],
+        maps.depth[t, up, column],
+        maps.depth[t, down, column],
+    )
     u, v = (column + 0.5 - k[0, 2]) / k[0, 0], (row + 0.5 - k[1, 2]) / k[1, 1]
-    ax, ay, az = z_r * (right + 0.5 - k[0, 2]) / k[0, 0] - z_l * (left + 0.5 - k[0, 2]) / k[0, 0], (z_r - z_l) * v, z_r - z_l
-    bx, by, bz = (z_d - z_u) * u, z_d * (down + 0.5 - k[1, 2]) / k[1, 1] - z_u * (up + 0.5 - k[1, 2]) / k[1, 1], z_d - z_u
+    ax, ay, az = (
+        z_r * (right + 0.5 - k[0, 2]) / k[0, 0] - z_l * (left + 0.5 - k[0, 2]) / k[0, 0],
+        (z_r - z_l) * v,
+        z_r - z_l,
+    )
+    bx, by, bz = (
+        (z_d - z_u) * u,
+        z_d * (down + 0.5 - k[1, 2]) / k[1, 1] - z_u * (up + 0.5 - k[1, 2]) / k[1, 1],
+        z_d - z_u,
+    )
     nx, ny, nz = by * az - bz * ay, bz * ax - bx * az, bx * ay - by * ax
     length = max(math.sqrt(nx * nx + ny * ny + nz * nz), 1e-12)
     z = maps.depth[t, row, column]
@@ -86,7 +100,8 @@ def _slopes(image, t, row, column):
 def _compare(maps, t, x, y, z, nx, ny, nz, out):
     """What a frame says of a point: MET, STRAY, IN_FRONT or NOTHING.
 
-    `out`: pixel row and column, signed distance from the surface along its normal (m), the surface's normal, px from the pixel's centre.
+    `out`: pixel row and column, distance from the surface along its normal (m), that normal, px from the pixel's
+    centre; all but the first two only where a surface is met.
     """
     if z <= 1e-6:
         return NOTHING
@@ -182,7 +197,7 @@ def _add(hessian, slope, weight, residual, gradient, arm, scale):
 
 @_inlined
 def _product(a, b):
-    """a b, both [3,3]."""
+    """Product of two matrices [3,3]."""
     out = np.zeros((3, 3))
     for i in range(3):
         for j in range(3):
@@ -192,7 +207,7 @@ def _product(a, b):
 
 @_inlined
 def _placed(a, b):
-    """a b of a matrix [>=3,>=3] and a point [3]."""
+    """Product of a matrix [3,3] and a point [3]."""
     out = np.zeros(3)
     for i in range(3):
         out[i] = a[i, 0] * b[0] + a[i, 1] * b[1] + a[i, 2] * b[2]

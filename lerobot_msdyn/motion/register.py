@@ -20,6 +20,7 @@ _MODEL_FRAMES = 14  # evenly spread, from which points are gathered; those half-
 _POINTS = 400  # of a frame
 _JUDGES = 150  # of a frame
 _JUDGED_FRAMES = 24
+_WORTH = 0.01  # of the judges' cost, that a finer level must take away
 
 
 @dataclass(frozen=True)
@@ -64,8 +65,10 @@ class Recording:
         def approve(level: MotionLevel) -> Bool[Tensor, " k"]:
             finer = replace(motion, names=(*motion.names, name), levels=(*motion.levels, level))
             before, part = self.costs(motion)
-            gain = torch.zeros(len(motion.levels[0])).index_add_(0, part, before - self.costs(finer)[0])
-            return gain > 0
+            total, gain = torch.zeros(2, len(cast(MotionLevel, motion.levels[0])))
+            total.index_add_(0, part, before)
+            gain.index_add_(0, part, before - self.costs(finer)[0])
+            return gain > _WORTH * total
 
         return approve
 

@@ -1,4 +1,4 @@
-"""Which points move as one rigid body, by what the whole video shows of them: parts are split, filled anew, given up."""
+"""Which points move as one rigid body, by what the video shows of them: parts are split, filled anew, given up."""
 
 from dataclasses import dataclass, replace
 
