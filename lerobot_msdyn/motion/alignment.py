@@ -16,6 +16,7 @@ from lerobot_msdyn.motion.lift import near_depth_edge
 _BORDER_PX = 2  # of the masks, without points
 _STEPS = 2  # of Gauss-Newton
 _LONGEST_STEP_PX = 3.0
+_TRACKS_SIGMA_PX = 5.0  # error of motions that come from tracks
 _LEAST_REACH_M = 1e-3
 
 
@@ -102,15 +103,14 @@ def align(
     sightings: Sightings,
     part: Int[Tensor, " n"],
     motions: Float[Tensor, "k t 4 4"],
-    held: Float[Tensor, "h k t 4 4"],
-    holds: Float[Tensor, "h k t"],
+    held: Float[Tensor, "k t 4 4"],
 ) -> Float[Tensor, "k t 4 4"]:
     """Motions (float64) after some Gauss-Newton steps towards what the video shows.
 
     Residuals have robust weights. Depth: distance from the recorded surface along its normal (point to plane, Chen and
     Medioni 1992), by projection. Colour: grey, but for the part's mean difference. Outline: distance outside the
-    masks, of points which nothing that stands still can hide. `held` are motions to which these are drawn, with the
-    weights `holds` (1/px^2 of what moves).
+    masks, of points which nothing that stands still can hide. `held` are motions from tracks, by which these are held
+    loosely.
     """
     order = part.argsort(stable=True)
     points, normals = sightings.at_canonical(motions, part)
@@ -128,7 +128,7 @@ def align(
     align_poses(
         poses,
         drawn,
-        (holds.double() / pixel_m**2).numpy(),
+        1 / (_TRACKS_SIGMA_PX * pixel_m) ** 2,
         pivots.numpy(),
         reach.numpy(),
         sorted_points,

@@ -22,6 +22,7 @@ OUTLINE_PX = 8.0  # farther outside the masks a point tells nothing
 SIGMAS = (0.5, 8.0, 1.0)  # px of depth, grey levels, px outside the masks
 OUTLIER = 3.0  # sigmas at which three quarters of the weight are lost (Geman-McClure)
 CORRELATED = 8.0  # neighbouring points, which err alike and count as one
+LEAST_CURVATURE = 1e-9  # of the normal equations, where nothing is seen or held
 UNSEEN = 0.5  # cost of a frame that tells nothing of a point, between those of agreement and of contradiction
 
 NOTHING, MET, STRAY, IN_FRONT = 0, 1, 2, 3
@@ -231,91 +232,98 @@ def _turned(rotation, step):
     return _product(turn, rotation)
 
 
+@_inlined
+def _look(points, first, last, pose, maps, t, status, terms):
+    """Compare some points with a frame; returns their mean difference of grey values.
+
+    `terms` become those of `_compare`, with the colour's gradient in place of the last two, the point in the camera,
+    and the difference of grey values.
+    """
+    mean, count = 0.0, 0
+    for i in range(first, last):
+        p, m = points.xyz[i], points.normals[i]
+        x = pose[0, 0] * p[0] + pose[0, 1] * p[1] + pose[0, 2] * p[2] + pose[0, 3]
+        y = pose[1, 0] * p[0] + pose[1, 1] * p[1] + pose[1, 2] * p[2] + pose[1, 3]
+        z = pose[2, 0] * p[0] + pose[2, 1] * p[1] + pose[2, 2] * p[2] + pose[2, 3]
+        nx = pose[0, 0] * m[0] + pose[0, 1] * m[1] + pose[0, 2] * m[2]
+        ny = pose[1, 0] * m[0] + pose[1, 1] * m[1] + pose[1, 2] * m[2]
+        nz = pose[2, 0] * m[0] + pose[2, 1] * m[1] + pose[2, 2] * m[2]
+        status[i] = _compare(maps, t, x, y, z, nx, ny, nz, terms[i])
+        terms[i, 8], terms[i, 9], terms[i, 10] = x, y, z
+        if status[i] == MET:
+            row, column = int(terms[i, 0]), int(terms[i, 1])
+            gx, gy = _slopes(maps.grey, t, row, column)
+            terms[i, 11] = maps.grey[t, row, column] + gx * terms[i, 6] + gy * terms[i, 7] - points.grey[i]
+            terms[i, 6], terms[i, 7] = gx, gy
+            mean += terms[i, 11]
+            count += 1
+    return mean / max(count, 1)
+
+
+@_inlined
+def _add_point(hessian, slope, found, term, mean, pivot, unit, maps, t):
+    """The residuals of one point, by what `_look` found."""
+    k = maps.intrinsics[t]
+    x, y, z = term[8], term[9], term[10]
+    arm = (x - pivot[0], y - pivot[1], z - pivot[2])
+    if found == MET:
+        sigma = SIGMAS[0] * maps.pixel_m
+        residual = term[2] / sigma
+        weight = 1 / (1 + (residual / OUTLIER) ** 2) ** 2 / CORRELATED
+        _add(hessian, slope, weight, residual, (term[3] / sigma, term[4] / sigma, term[5] / sigma), arm, unit)
+        residual = (term[11] - mean) / SIGMAS[1]
+        weight = 1 / (1 + (residual / OUTLIER) ** 2) ** 2 / CORRELATED
+        gx, gy = term[6] / SIGMAS[1], term[7] / SIGMAS[1]
+    else:
+        row, column = int(term[0]), int(term[1])
+        residual = maps.outside[t, row, column] / (OUTSIDE_UNIT * SIGMAS[2])
+        weight = 1 / CORRELATED
+        gx, gy = _slopes(maps.outside, t, row, column)
+        gx, gy = gx / (OUTSIDE_UNIT * SIGMAS[2]), gy / (OUTSIDE_UNIT * SIGMAS[2])
+    gx, gy = gx * k[0, 0] / z, gy * k[1, 1] / z
+    _add(hessian, slope, weight, residual, (gx, gy, -(gx * x + gy * y) / z), arm, unit)
+
+
+@_inlined
+def _add_hold(hessian, slope, hold, pose, held, middle, unit):
+    """The pull of a pose to another one; `middle` is the part's pivot at the canonical frame."""
+    turn = _product(pose, held[:3, :3].T)
+    gone = _placed(pose, middle) + pose[:3, 3] - _placed(held, middle) - held[:3, 3]
+    slope[0] += hold * (turn[2, 1] - turn[1, 2]) / 2 / unit
+    slope[1] += hold * (turn[0, 2] - turn[2, 0]) / 2 / unit
+    slope[2] += hold * (turn[1, 0] - turn[0, 1]) / 2 / unit
+    for i in range(3):
+        slope[3 + i] += hold * gone[i]
+    for i in range(6):
+        hessian[i, i] += hold
+
+
 @_compiled
-def align_poses(poses, held, holds, pivots, reach, points, maps, steps, longest):
+def align_poses(poses, held, hold, pivots, reach, points, maps, steps, longest):
     """Gauss-Newton steps of poses (camera from canonical) [k,t,4,4], float64, in place.
 
-    `held` [h,k,t,4,4] are poses to which they are drawn with the weights `holds` [h,k,t] (1/m^2, of a turn times
-    the part's reach and of the shift of the pivot). Steps are `longest` (m) at most.
+    Each is drawn to the pose in `held` (the same shape) with the weight `hold` (1/m^2, of a turn times the part's
+    `reach` and of the shift of its pivot). Steps are `longest` (m) at most.
     """
-    parts, frames = poses.shape[:2]
-    n = len(points.xyz)
-    status, terms = np.zeros(n, np.int64), np.zeros((n, 12))
-    depth_sigma = SIGMAS[0] * maps.pixel_m
-    for part in range(parts):
+    status, terms = np.zeros(len(points.xyz), np.int64), np.zeros((len(points.xyz), 12))
+    for part in range(poses.shape[0]):
         first, last = points.first[part], points.first[part + 1]
         unit = 1 / reach[part]
-        for t in range(frames):
-            k = maps.intrinsics[t]
+        for t in range(poses.shape[1]):
             pose = poses[part, t]
             for _ in range(steps):
-                r = pose[:3, :3].copy()
-                pivot = _placed(r, pivots[part]) + pose[:3, 3]
-                mean, count = 0.0, 0
-                for i in range(first, last):
-                    p, m = points.xyz[i], points.normals[i]
-                    x = r[0, 0] * p[0] + r[0, 1] * p[1] + r[0, 2] * p[2] + pose[0, 3]
-                    y = r[1, 0] * p[0] + r[1, 1] * p[1] + r[1, 2] * p[2] + pose[1, 3]
-                    z = r[2, 0] * p[0] + r[2, 1] * p[1] + r[2, 2] * p[2] + pose[2, 3]
-                    nx = r[0, 0] * m[0] + r[0, 1] * m[1] + r[0, 2] * m[2]
-                    ny = r[1, 0] * m[0] + r[1, 1] * m[1] + r[1, 2] * m[2]
-                    nz = r[2, 0] * m[0] + r[2, 1] * m[1] + r[2, 2] * m[2]
-                    status[i] = _compare(maps, t, x, y, z, nx, ny, nz, terms[i])
-                    terms[i, 8], terms[i, 9], terms[i, 10] = x, y, z
-                    if status[i] == MET:
-                        row, column = int(terms[i, 0]), int(terms[i, 1])
-                        gx, gy = _slopes(maps.grey, t, row, column)
-                        terms[i, 11] = maps.grey[t, row, column] + gx * terms[i, 6] + gy * terms[i, 7] - points.grey[i]
-                        terms[i, 6], terms[i, 7] = gx, gy
-                        mean += terms[i, 11]
-                        count += 1
-                mean /= max(count, 1)
+                mean = _look(points, first, last, pose, maps, t, status, terms)
+                pivot = _placed(pose, pivots[part]) + pose[:3, 3]
                 hessian, step = np.zeros((6, 6)), np.zeros(6)
                 for i in range(first, last):
-                    if status[i] != MET and status[i] != STRAY:
-                        continue
-                    row, column = int(terms[i, 0]), int(terms[i, 1])
-                    x, y, z = terms[i, 8], terms[i, 9], terms[i, 10]
-                    arm = (x - pivot[0], y - pivot[1], z - pivot[2])
-                    if status[i] == MET:
-                        residual = terms[i, 2] / depth_sigma
-                        weight = 1 / (1 + (residual / OUTLIER) ** 2) ** 2 / CORRELATED
-                        gradient = (terms[i, 3] / depth_sigma, terms[i, 4] / depth_sigma, terms[i, 5] / depth_sigma)
-                        _add(hessian, step, weight, residual, gradient, arm, unit)
-                        residual = (terms[i, 11] - mean) / SIGMAS[1]
-                        weight = 1 / (1 + (residual / OUTLIER) ** 2) ** 2 / CORRELATED
-                        gx, gy = terms[i, 6] / SIGMAS[1], terms[i, 7] / SIGMAS[1]
-                    else:
-                        residual = maps.outside[t, row, column] / OUTSIDE_UNIT / SIGMAS[2]
-                        weight = 1 / CORRELATED
-                        gx, gy = _slopes(maps.outside, t, row, column)
-                        gx, gy = gx / OUTSIDE_UNIT / SIGMAS[2], gy / OUTSIDE_UNIT / SIGMAS[2]
-                    gx, gy = gx * k[0, 0] / z, gy * k[1, 1] / z
-                    _add(hessian, step, weight, residual, (gx, gy, -(gx * x + gy * y) / z), arm, unit)
-                for h in range(len(held)):
-                    weight = holds[h, part, t]
-                    if weight == 0:
-                        continue
-                    other = held[h, part, t]
-                    q = other[:3, :3].copy()
-                    turn = _product(r, q.T)
-                    start = _placed(q, pivots[part]) + other[:3, 3]
-                    gone = (
-                        (turn[2, 1] - turn[1, 2]) / 2 / unit,
-                        (turn[0, 2] - turn[2, 0]) / 2 / unit,
-                        (turn[1, 0] - turn[0, 1]) / 2 / unit,
-                        pivot[0] - start[0],
-                        pivot[1] - start[1],
-                        pivot[2] - start[2],
-                    )
-                    for i in range(6):
-                        hessian[i, i] += weight
-                        step[i] += weight * gone[i]
+                    if status[i] == MET or status[i] == STRAY:
+                        _add_point(hessian, step, status[i], terms[i], mean, pivot, unit, maps, t)
+                _add_hold(hessian, step, hold, pose, held[part, t], pivots[part], unit)
                 for i in range(6):
-                    hessian[i, i] += 1e-9
+                    hessian[i, i] += LEAST_CURVATURE
                 _solve6(hessian, step)
                 for i in range(6):
                     step[i] = -min(max(step[i], -longest), longest)
-                rotation = _turned(r, step[:3] * unit)
+                rotation = _turned(pose[:3, :3], step[:3] * unit)
                 pose[:3, :3] = rotation
                 pose[:3, 3] = pivot + step[3:] - _placed(rotation, pivots[part])

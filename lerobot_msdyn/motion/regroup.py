@@ -14,7 +14,6 @@ _SPREADS = 2  # ... so many times in a row
 _SPLITS = 2  # times that every part is tried as two
 _LEAST_POINTS = 40  # of a part
 _WORTH = 0.005  # mean cost of an instance's points, that each of its parts must save
-_HOLD = 0.04  # 1/px^2: motions from tracks err by 5 px
 
 
 @dataclass(frozen=True)
@@ -52,8 +51,7 @@ def regroup(video: Video, points: Sightings, start: Grouping, max_parts: int) ->
 
 def aligned(video: Video, points: Sightings, found: Grouping) -> Grouping:
     """Moving parts after some steps towards what the video shows, loosely held by their motions from tracks."""
-    holds = torch.full((1, *found.motions.shape[:2]), _HOLD)
-    motions = align(video, points, found.part, found.motions, found.tracked[None], holds)
+    motions = align(video, points, found.part, found.motions, found.tracked)
     return replace(found, motions=torch.where(found.active[:, None, None, None], motions, found.motions))
 
 

@@ -26,10 +26,9 @@ def test_alignment_takes_out_most_of_a_small_shift(
     video: Video, points: Sightings, truth: Grouping, cost: Callable[[Grouping], float]
 ) -> None:
     off = shifted(truth, video)
-    nothing = torch.zeros(1, *off.motions.shape[:2])
     found = off
     for _ in range(3):
-        motions = align(video, points, truth.part, found.motions, off.motions[None], nothing)
+        motions = align(video, points, truth.part, found.motions, off.motions)
         found = replace(off, motions=motions)
     best, worst = cost(truth), cost(off)
     assert cost(found) - best < 0.5 * (worst - best)
