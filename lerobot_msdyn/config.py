@@ -113,7 +113,7 @@ class MotionConfig:
     flat_bases: int = 10
     # Keep a finer level, part by part, only where it predicts tracks better that it was not fitted to.
     gate: bool = True
-    # Refine the rigid parts' poses by the recorded depth, colours and outlines; only where depth is metric.
+    # Find the rigid parts and their poses by the recorded depth, colours and outlines; only where depth is metric.
     register: bool = True
     frames_per_knot: FramesPerKnot = field(default_factory=FramesPerKnot)
 

@@ -1,5 +1,6 @@
 """Primitives, grains, particles: levels built on what the coarser ones leave, kept where they prove themselves."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -36,6 +37,8 @@ _WORTH = 0.01  # of the error, that a level must take away
 _VISIBLE_PX = 0.3  # that a level must explain: less is not seen, and the drift of the tracks themselves
 _SURE = 3.0  # standard errors that the gain must be: some ten pairs of part and level are judged per episode
 
+Approve = Callable[[MotionLevel], Bool[Tensor, " p"]]  # parts in which a level agrees with what else is known
+
 
 def add_level(
     name: LevelName,
@@ -44,12 +47,13 @@ def add_level(
     so_far: SceneMotion,
     config: MotionConfig,
     noise: float,
+    approve: Approve | None = None,
 ) -> tuple[MotionLevel, ResidualTracks]:
     """The next level, and the tracks as it leaves them.
 
     Each third of the tracks judges a level that was fitted to the others (cross-validation). They choose how much each
     basis is smoothed over time, and, with `config.gate`, in which parts the level is kept: where it explains
-    a visible motion of theirs, and surely so (`_proven`); elsewhere its bases are inactive.
+    a visible motion of theirs, and surely so (`_proven`), and `approve` agrees; elsewhere its bases are inactive.
     """
     names, levels, canonical = (*so_far.names, name), so_far.levels, so_far.canonical_frame
     owner, parents = _cluster(name, tracks, config, noise)
@@ -83,7 +87,10 @@ def add_level(
             judged = _prediction(level(trial, smoothing), name, fold == k, tracks, seen, so_far)
             error[fold == k], gain[fold == k] = judged
         kept = torch.zeros(len(found), dtype=torch.bool)
-        kept[owner[_proven(error, gain, tracks.part, _VISIBLE_PX * seen.pixel_m)[tracks.part]]] = True
+        proven = _proven(error, gain, tracks.part, _VISIBLE_PX * seen.pixel_m)
+        if approve is not None and bool(proven.any()):
+            proven &= approve(found)[: len(proven)]
+        kept[owner[proven[tracks.part]]] = True
         coarser = so_far.levels[-1]
         if name == "grain" and isinstance(coarser, MotionLevel):  # where its primitive was refused, it refines nothing
             kept &= coarser.active[found.parents.clamp(min=0)]
