@@ -22,7 +22,7 @@ from lerobot_msdyn.fitting import FitResult, fit
 from lerobot_msdyn.initialisation import initialise
 from lerobot_msdyn.perturbation import draw_offset, draw_rng, look_at_distance, perturb
 from lerobot_msdyn.priors import PointTracks, Priors, estimate_priors
-from lerobot_msdyn.provenance import SOURCE_VARIANT, Provenance
+from lerobot_msdyn.provenance import SOURCE_VARIANT, Provenance, merged
 from lerobot_msdyn.quality import HOLE_ALPHA, fill_holes
 from lerobot_msdyn.rendering import render_frames
 from lerobot_msdyn.shared import (
@@ -40,6 +40,7 @@ logger = logging.getLogger(__name__)
 SHARP_DEPTH = ("recorded", "plane")  # providers whose depth has sharp edges and agrees between frames
 ROUGH_BORDER_PX = 2  # with the others' depth: from the border of a mask ...
 ROUGH_FRAMES = 6  # ... and so few frames are gathered, whose depths disagree
+NEAR = 0.01  # of the look-at distance, within which nothing is drawn: depth may be of any scale
 FURTHER_STEPS = 0.6  # share of the fit's steps that suffices where the static set has been fitted already
 
 Backgrounds = Mapping[str, Sequence[SharedBackground]]  # by camera
@@ -52,8 +53,8 @@ class Reconstruction:
 
     results: tuple[FitResult, ...]
     starts: tuple[int, ...]  # first frame of each window
-    metric: bool  # whether depth is in true metres
-    provenance: dict[str, dict[str, str]]  # prior -> provider, why, model and licence, of the first window
+    metric: bool  # whether depth is in true metres, in all windows
+    provenance: dict[str, dict[str, str]]  # prior -> provider, why, model and licence, of all windows
     camera: CameraTrack  # at the size of the recorded video
     distance: float  # m, to the look-at point
 
@@ -96,12 +97,14 @@ def _fitted(background: SharedBackground, recipe: Recipe) -> SharedBackground:
     if not bool((empty.depth > 0).any()):
         return background
     nothing = torch.zeros(1, *empty.seen.shape, dtype=torch.uint8)
-    priors = Priors(empty.depth[None], nothing, empty.rgb, _no_tracks(), metric=True)
+    priors = Priors(empty.depth[None], nothing, _no_tracks(), metric=True)
     view = View(empty.rgb[None], camera)
     scene = initialise(view, priors, replace(recipe.scene, moving_gaussians=0), recipe.motion, empty)
     config = replace(recipe.fit, steps=recipe.fit.steps // 2, shadows=False, held_out_frames=0)
     try:
-        result = fit(scene, view, priors, config, distance=look_at_distance(empty.depth), seed=recipe.seed)
+        distance = look_at_distance(empty.depth)
+        scene = replace(scene, near=NEAR * distance)
+        result = fit(scene, view, priors, config, empty=empty.rgb, distance=distance, seed=recipe.seed)
     except EpisodeError as error:
         logger.warning("shared background: %s; every episode fits its own", error)
         return background
@@ -198,7 +201,8 @@ def reconstruct(
     results, known, distances, cameras = zip(*fitted, strict=True)
     starts = tuple(start for start, _ in windows)
     camera = concatenated(cameras).resized(view.camera.width, view.camera.height)
-    return Reconstruction(results, starts, known[0].metric, known[0].provenance, camera, distances[0])
+    metric = all(priors.metric for priors in known)
+    return Reconstruction(results, starts, metric, merged([p.provenance for p in known]), camera, distances[0])
 
 
 def _windows(view: View, recipe: Recipe) -> list[tuple[int, View]]:
@@ -235,9 +239,8 @@ def _fit_window(
         empty = empty_scene(view.rgb, priors.depth, priors.instances)
         if shared is not None:
             empty = completed(empty, shared.empty)
-        priors = replace(priors, empty=empty.rgb)
         distance = look_at_distance(empty.depth)
-        scene = initialise(view, priors, settings, recipe.motion, empty)
+        scene = replace(initialise(view, priors, settings, recipe.motion, empty), near=NEAR * distance)
         if shared is not None and shared.static is not None:
             scene = replace(scene, static=adapted(shared, empty, scene.static))
             steps = round(FURTHER_STEPS * steps)
@@ -246,6 +249,7 @@ def _fit_window(
         view,
         priors,
         replace(recipe.fit, steps=steps),
+        empty=empty.rgb,
         distance=distance,
         seed=recipe.seed,
         progress=lambda done: progress(done / steps),

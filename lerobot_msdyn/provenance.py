@@ -2,6 +2,7 @@
 
 import importlib.metadata
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -24,6 +25,17 @@ class Provenance:
     priors: dict[str, dict[str, dict[str, str]]] = field(
         default_factory=dict
     )  # camera -> prior -> provider, why, model
+
+
+def merged(entries: Sequence[dict[str, dict[str, str]]]) -> dict[str, dict[str, str]]:
+    """What is known about the priors of a video's windows, as one: where they differ, all that was said, in order."""
+    names = dict.fromkeys(name for entry in entries for name in entry)
+    together: dict[str, dict[str, str]] = {}
+    for name in names:
+        found = [entry[name] for entry in entries if name in entry]
+        keys = dict.fromkeys(key for some in found for key in some)
+        together[name] = {key: "; ".join(dict.fromkeys(some[key] for some in found if key in some)) for key in keys}
+    return together
 
 
 def write_provenance(root: Path, episodes: list[Provenance], recipe_yaml: str) -> None:

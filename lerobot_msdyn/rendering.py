@@ -35,6 +35,7 @@ def draw(scene: DynamicScene, camera: CameraTrack, frames: Tensor, backend: str 
         camera.intrinsics,
         camera.width,
         camera.height,
+        near=scene.near,
         backend=backend,
     )
     return Rendering(raster.features[..., :3], raster.depth, raster.alpha, raster.features[..., 3])

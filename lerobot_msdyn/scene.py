@@ -17,10 +17,11 @@ from lerobot_msdyn.motion.compose import Level, compose
 from lerobot_msdyn.motion.field import DeformationField
 from lerobot_msdyn.shading import Shading
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 LEVEL_KINDS: dict[str, type] = {"bases": MotionLevel, "field": DeformationField}
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic
 SH_C1 = 0.4886025119029199  # of the three linear ones
+_SMALLEST_M = 1e-9  # standard deviation: far below any surface's, also where depth is of a wrong scale
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ def gaussians_from_points(
     return Gaussians(
         means=means.contiguous(),
         quats=quats.contiguous(),
-        log_scales=scales.clamp(min=1e-6).log(),
+        log_scales=scales.clamp(min=_SMALLEST_M).log(),
         opacity_logits=logit.expand(len(means)).clone(),
         sh=rgb_to_sh(rgb),
     )
@@ -114,6 +115,7 @@ class DynamicScene:
     logits: tuple[Float[Tensor, "n _"], ...]  # per level: their weights before the softmax
     frames: int
     shading: Shading | None = None  # none: brightness does not change
+    near: float = 0.01  # m; nothing that is as near to a camera is drawn
 
     def at(self, frames: Int[Tensor, " b"], eye: Float[Tensor, "b 3"] | None = None) -> Snapshot:
         """The scene at some frames, differentiable in all Gaussians and bases.
@@ -175,6 +177,7 @@ def save_scene(scene: DynamicScene, path: Path) -> None:
         "schema": SCHEMA_VERSION,
         "levels": [names[type(level)] for level in scene.levels],
         "frames": scene.frames,
+        "near": scene.near,
     }
     partial = path.with_name(path.name + ".partial")
     save_file(
@@ -213,6 +216,7 @@ def load_scene(path: Path) -> DynamicScene:
             logits=tuple(tensors[f"levels.{i}.logits"] for i in range(len(kinds))),
             frames=header["frames"],
             shading=Shading(**part("shading", Shading)) if "shading.field" in tensors else None,
+            near=header["near"],
         )
     except KeyError as error:
         raise MsdynError(f"{path}: not a readable scene file ({error} is missing)") from error

@@ -58,15 +58,6 @@ def temporal_median(
     return torch.from_numpy(median), torch.from_numpy(noise)
 
 
-def empty_scene(
-    rgb: UInt8[Tensor, "t h w 3"], instances: UInt8[Tensor, "t h w"], median: UInt8[Tensor, "h w 3"]
-) -> UInt8[Tensor, "h w 3"]:
-    """The temporal median over frames in which nothing moves at the pixel; the plain `median` where there is none."""
-    mask = instances.cpu().numpy() > 0
-    around = np.stack([cv2.dilate(m.astype(np.uint8), np.ones((5, 5), np.uint8)) for m in mask])
-    return torch.from_numpy(_median_where(rgb.cpu().numpy(), around == 0, median.cpu().numpy()))
-
-
 def moving_instances(
     rgb: UInt8[Tensor, "t h w 3"],
     median: UInt8[Tensor, "h w 3"],
