@@ -17,19 +17,21 @@ from lerobot_msdyn.background import empty_scene
 from lerobot_msdyn.cameras import CameraTrack, concatenated
 from lerobot_msdyn.config import Recipe, SceneConfig
 from lerobot_msdyn.episode import View, depth_key_of, read_episode, shrink
-from lerobot_msdyn.errors import EpisodeError
+from lerobot_msdyn.errors import EpisodeError, PriorError
 from lerobot_msdyn.fitting import FitResult, fit
 from lerobot_msdyn.initialisation import initialise
 from lerobot_msdyn.perturbation import draw_offset, draw_rng, look_at_distance, perturb
-from lerobot_msdyn.priors import PointTracks, Priors, estimate_priors
+from lerobot_msdyn.priors import PointTracks, Priors, estimate_masks, estimate_priors
 from lerobot_msdyn.provenance import SOURCE_VARIANT, Provenance, merged
 from lerobot_msdyn.quality import HOLE_ALPHA, fill_holes
+from lerobot_msdyn.render.threads import torch_on_one_thread
 from lerobot_msdyn.rendering import render_frames
 from lerobot_msdyn.shared import (
     MAX_EPISODES,
     SharedBackground,
     adapted,
     completed,
+    few,
     few_frames,
     share_backgrounds,
 )
@@ -79,16 +81,46 @@ def shared_backgrounds(source: LeRobotDatasetMetadata, cameras: list[str], recip
     """
     if not recipe.scene.shared_background or source.total_episodes < 2:
         return {}
-    views: dict[str, list[View]] = {key: [] for key in cameras}
+    views: dict[str, dict[int, View]] = {key: {} for key in cameras}  # by episode
     count = min(MAX_EPISODES, source.total_episodes)
     for index in sorted({round(i * (source.total_episodes - 1) / (count - 1)) for i in range(count)}):
         with contextlib.suppress(EpisodeError):
             episode = read_episode(source, index, cameras, recipe.camera, recorded_depth=recipe.priors.depth != "plane")
             for key, view in episode.views.items():
-                views[key].append(shrink(few_frames(view), recipe.fit.max_width))
-    with _one_torch_thread():
-        found = {key: share_backgrounds(some) for key, some in views.items()}
-    return {key: [_fitted(background, recipe) for background in some] for key, some in found.items()}
+                views[key][index] = shrink(few_frames(view), recipe.fit.max_width)
+    found: dict[str, list[SharedBackground]] = {}
+    for key, some in views.items():
+
+        def moving(number: int, frames: Tensor, key: str = key, some: dict[int, View] = some) -> Tensor:
+            index = list(some)[number]
+            view = read_episode(source, index, [key], recipe.camera, recorded_depth=False).views[key]
+            try:
+                return _moving_in_few(view, recipe, frames, index, key)
+            except PriorError as error:  # a file of masks may be there for some episodes alone
+                logger.warning("shared background: episode %d is left out: %s", index, error)
+                return torch.ones(len(some[index].rgb), *frames.shape[1:3], dtype=torch.uint8)
+
+        with torch_on_one_thread():
+            shared = share_backgrounds(list(some.values()), moving)
+            found[key] = [_fitted(background, recipe) for background in shared]
+    return found
+
+
+def _moving_in_few(view: View, recipe: Recipe, elsewhere: Tensor, episode: int | None, key: str | None) -> Tensor:
+    """What moves in the frames that `few_frames` takes; the masks of the whole video, which its fit finds cached."""
+    masks = [
+        estimate_masks(
+            shrink(window, recipe.fit.max_width),
+            recipe.priors,
+            recipe.camera,
+            elsewhere=elsewhere,
+            episode=episode,
+            key=key,
+            device=recipe.device,
+        )
+        for _, window in _windows(view, recipe)
+    ]
+    return torch.cat(masks)[few(len(view.rgb))]
 
 
 def _fitted(background: SharedBackground, recipe: Recipe) -> SharedBackground:
@@ -180,7 +212,12 @@ def reconstruct(
     windows = _windows(view, recipe)
     if len(windows) > 1 and not backgrounds and recipe.scene.shared_background:
         some = [shrink(few_frames(window), recipe.fit.max_width) for _, window in windows]
-        backgrounds = [_fitted(background, recipe) for background in share_backgrounds(some)]
+
+        def moving(number: int, frames: Tensor) -> Tensor:
+            return _moving_in_few(windows[number][1], recipe, frames, episode, key)
+
+        with torch_on_one_thread():
+            backgrounds = [_fitted(background, recipe) for background in share_backgrounds(some, moving)]
     beside = [[shrink(window, recipe.fit.max_width) for _, window in _windows(other, recipe)] for other in others]
     fitted = []
     for number, (_, window) in enumerate(windows):
@@ -226,7 +263,7 @@ def _fit_window(
 ) -> tuple[FitResult, Priors, float, CameraTrack]:
     """A fitted scene of one window at the size at which it is fitted, its priors, look-at distance (m) and camera."""
     steps, settings = recipe.fit.steps, recipe.scene
-    with _one_torch_thread():
+    with torch_on_one_thread():
         shared = next((background for background in backgrounds if background.fits(view)), None)
         priors = priors_of(view, elsewhere=None if shared is None else shared.frames)
         view = replace(view, camera=priors.camera or view.camera)
@@ -238,22 +275,22 @@ def _fit_window(
             settings = _for_rough_depth(settings)
         empty = empty_scene(view.rgb, priors.depth, priors.instances)
         if shared is not None:
-            empty = completed(empty, shared.empty)
+            empty = completed(empty, shared.empty, len(view.rgb))
         distance = look_at_distance(empty.depth)
         scene = replace(initialise(view, priors, settings, recipe.motion, empty), near=NEAR * distance)
         if shared is not None and shared.static is not None:
             scene = replace(scene, static=adapted(shared, empty, scene.static))
             steps = round(FURTHER_STEPS * steps)
-    result = fit(
-        scene,
-        view,
-        priors,
-        replace(recipe.fit, steps=steps),
-        empty=empty.rgb,
-        distance=distance,
-        seed=recipe.seed,
-        progress=lambda done: progress(done / steps),
-    )
+        result = fit(
+            scene,
+            view,
+            priors,
+            replace(recipe.fit, steps=steps),
+            empty=empty.rgb,
+            distance=distance,
+            seed=recipe.seed,
+            progress=lambda done: progress(done / steps),
+        )
     return result, priors, distance, view.camera
 
 
@@ -264,17 +301,6 @@ def _for_rough_depth(scene: SceneConfig) -> SceneConfig:
         mask_border_px=max(scene.mask_border_px, ROUGH_BORDER_PX),
         moving_frames=min(scene.moving_frames, ROUGH_FRAMES),
     )
-
-
-@contextlib.contextmanager
-def _one_torch_thread() -> Iterator[None]:
-    """Thousands of small solves are several times slower when torch spreads each over all cores."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def by_feature(

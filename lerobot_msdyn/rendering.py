@@ -9,6 +9,7 @@ from torch import Tensor
 
 from lerobot_msdyn.cameras import CameraTrack
 from lerobot_msdyn.render import Raster, rasterize
+from lerobot_msdyn.render.threads import torch_on_one_thread
 from lerobot_msdyn.scene import DynamicScene
 
 
@@ -49,4 +50,6 @@ def render_frames(
     frames = torch.arange(scene.frames) if frames is None else frames
     for start in range(0, len(frames), batch):
         part = slice(start, min(start + batch, len(frames)))
-        yield draw(scene, camera.select(part), frames[part], backend)
+        with torch_on_one_thread():
+            drawn = draw(scene, camera.select(part), frames[part], backend)
+        yield drawn

@@ -83,7 +83,16 @@ def test_no_steps_at_all() -> None:
 def test_progress_is_reported_step_by_step() -> None:
     view, priors = still_video()
     seen: list[int] = []
-    fit(grey_scene(view), view, priors, FitConfig(steps=4), empty=view.rgb[0], distance=1.0, seed=0, progress=seen.append)
+    fit(
+        grey_scene(view),
+        view,
+        priors,
+        FitConfig(steps=4),
+        empty=view.rgb[0],
+        distance=1.0,
+        seed=0,
+        progress=seen.append,
+    )
     assert seen == [1, 1, 1, 1]
 
 

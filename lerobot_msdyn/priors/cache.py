@@ -29,6 +29,7 @@ Arrays = dict[str, np.ndarray]
 
 ENVIRONMENT = "LEROBOT_MSDYN_CACHE"
 _DIGEST = 16  # bytes
+_OFF = ("off", "False")  # YAML reads off as false
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class PriorCache:
 
 def open_cache(setting: str, rgb: UInt8[Tensor, "t h w 3"]) -> PriorCache:
     """The cache of a video under the folder that the setting names: `auto`, `off`, or the folder itself."""
-    if setting == "off":
+    if setting in _OFF:
         return PriorCache(None)
     folder = default_folder() if setting == "auto" else Path(setting).expanduser()
     return PriorCache(folder / digest_of(rgb))

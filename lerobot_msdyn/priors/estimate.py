@@ -61,3 +61,18 @@ def estimate_priors(
         logger.info("%s: %s%s", prior, origin.line, found.get(prior, ""))
     provenance = {prior: origin.entry() for prior, origin in origins.items()}
     return Priors(depth, instances, tracks, metric, provenance, pinhole)
+
+
+def estimate_masks(
+    view: View,
+    config: PriorsConfig,
+    camera: CameraConfig,
+    *,
+    elsewhere: UInt8[Tensor, "m h w 3"] | None = None,
+    episode: int | None = None,
+    key: str | None = None,
+    device: str = "auto",
+) -> UInt8[Tensor, "t h w"]:
+    """The masks of `estimate_priors` alone (0 = nothing moves), which finds them in the cache afterwards."""
+    cache = open_cache(config.cache, view.rgb)
+    return provide_masks(Request(view, config, camera, cache, (), elsewhere, episode, key, torch_device(device)))[0]
