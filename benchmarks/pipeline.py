@@ -65,6 +65,7 @@ def measure(case: Case, recipe_name: str, steps: int | None, pipe: Connection) -
     from lerobot_msdyn.episode import open_source
     from lerobot_msdyn.perturbation import draw_offset, draw_rng, perturb
     from lerobot_msdyn.render.warmup import warm_up
+    from lerobot_msdyn.sharing import shared_backgrounds
     from lerobot_msdyn.synthetic import make_scene
     from lerobot_msdyn.synthetic.dataset import write_dataset
 
@@ -81,7 +82,7 @@ def measure(case: Case, recipe_name: str, steps: int | None, pipe: Connection) -
         write_dataset(scenes, "local/bench", Path(folder) / "bench", cameras=["front"], depth=True)
         source = open_source("local/bench", Path(folder) / "bench")
         key = "observation.images.front"
-        share = timed(pipeline.shared_backgrounds, "shared background", seconds)
+        share = timed(shared_backgrounds, "shared background", seconds)
         read = timed(pipeline.read_episode, "read", seconds)
         render = timed(lambda scene, camera: list(pipeline.new_pictures(scene, camera)), "render", seconds)
         backgrounds = share(source, [key], recipe)

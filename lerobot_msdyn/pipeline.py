@@ -1,10 +1,8 @@
 """The whole flow on one screen: an episode in, a scene per camera, new episodes out."""
 
-import contextlib
 import functools
-import itertools
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,24 +15,21 @@ from lerobot_msdyn.background import empty_scene
 from lerobot_msdyn.cameras import CameraTrack, concatenated
 from lerobot_msdyn.config import Recipe, SceneConfig
 from lerobot_msdyn.episode import View, depth_key_of, read_episode, shrink
-from lerobot_msdyn.errors import EpisodeError, PriorError
 from lerobot_msdyn.fitting import FitResult, fit
 from lerobot_msdyn.initialisation import initialise
 from lerobot_msdyn.perturbation import draw_offset, draw_rng, look_at_distance, perturb
-from lerobot_msdyn.priors import PointTracks, Priors, estimate_masks, estimate_priors
+from lerobot_msdyn.priors import Priors, estimate_priors
 from lerobot_msdyn.provenance import SOURCE_VARIANT, Provenance, merged
 from lerobot_msdyn.quality import HOLE_ALPHA, fill_holes
 from lerobot_msdyn.render.threads import torch_on_one_thread
 from lerobot_msdyn.rendering import render_frames
 from lerobot_msdyn.shared import (
-    MAX_EPISODES,
     SharedBackground,
     adapted,
     completed,
-    few,
     few_frames,
-    share_backgrounds,
 )
+from lerobot_msdyn.sharing import NEAR, Backgrounds, moving_in_few, share, windows
 from lerobot_msdyn.write import NewEpisode, OutputDataset
 
 logger = logging.getLogger(__name__)
@@ -42,10 +37,8 @@ logger = logging.getLogger(__name__)
 SHARP_DEPTH = ("recorded", "plane")  # providers whose depth has sharp edges and agrees between frames
 ROUGH_BORDER_PX = 2  # with the others' depth: from the border of a mask ...
 ROUGH_FRAMES = 6  # ... and so few frames are gathered, whose depths disagree
-NEAR = 0.01  # of the look-at distance, within which nothing is drawn: depth may be of any scale
 FURTHER_STEPS = 0.6  # share of the fit's steps that suffices where the static set has been fitted already
 
-Backgrounds = Mapping[str, Sequence[SharedBackground]]  # by camera
 Progress = Callable[[str, float], object]  # (what is being done, share of the episode done since the last call)
 
 
@@ -72,80 +65,6 @@ class Picture:
 
     rgb: UInt8[np.ndarray, "h w 3"]
     depth: Float32[np.ndarray, "h w"]  # m, z-depth; 0 where nothing is known, and everywhere if there is no true scale
-
-
-def shared_backgrounds(source: LeRobotDatasetMetadata, cameras: list[str], recipe: Recipe) -> Backgrounds:
-    """Per camera, what some of its episodes show together, fitted once; one for every place in which it stood.
-
-    Episodes that cannot be read are left out here, and reported when it is their turn.
-    """
-    if not recipe.scene.shared_background or source.total_episodes < 2:
-        return {}
-    views: dict[str, dict[int, View]] = {key: {} for key in cameras}  # by episode
-    count = min(MAX_EPISODES, source.total_episodes)
-    for index in sorted({round(i * (source.total_episodes - 1) / (count - 1)) for i in range(count)}):
-        with contextlib.suppress(EpisodeError):
-            episode = read_episode(source, index, cameras, recipe.camera, recorded_depth=recipe.priors.depth != "plane")
-            for key, view in episode.views.items():
-                views[key][index] = shrink(few_frames(view), recipe.fit.max_width)
-    found: dict[str, list[SharedBackground]] = {}
-    for key, some in views.items():
-
-        def moving(number: int, frames: Tensor, key: str = key, some: dict[int, View] = some) -> Tensor:
-            index = list(some)[number]
-            view = read_episode(source, index, [key], recipe.camera, recorded_depth=False).views[key]
-            try:
-                return _moving_in_few(view, recipe, frames, index, key)
-            except PriorError as error:  # a file of masks may be there for some episodes alone
-                logger.warning("shared background: episode %d is left out: %s", index, error)
-                return torch.ones(len(some[index].rgb), *frames.shape[1:3], dtype=torch.uint8)
-
-        with torch_on_one_thread():
-            shared = share_backgrounds(list(some.values()), moving)
-            found[key] = [_fitted(background, recipe) for background in shared]
-    return found
-
-
-def _moving_in_few(view: View, recipe: Recipe, elsewhere: Tensor, episode: int | None, key: str | None) -> Tensor:
-    """What moves in the frames that `few_frames` takes; the masks of the whole video, which its fit finds cached."""
-    masks = [
-        estimate_masks(
-            shrink(window, recipe.fit.max_width),
-            recipe.priors,
-            recipe.camera,
-            elsewhere=elsewhere,
-            episode=episode,
-            key=key,
-            device=recipe.device,
-        )
-        for _, window in _windows(view, recipe)
-    ]
-    return torch.cat(masks)[few(len(view.rgb))]
-
-
-def _fitted(background: SharedBackground, recipe: Recipe) -> SharedBackground:
-    """A shared background with a static set that was fitted to its picture; without depth there is none."""
-    empty, camera = background.empty, background.camera
-    if not bool((empty.depth > 0).any()):
-        return background
-    nothing = torch.zeros(1, *empty.seen.shape, dtype=torch.uint8)
-    priors = Priors(empty.depth[None], nothing, _no_tracks(), metric=True)
-    view = View(empty.rgb[None], camera)
-    scene = initialise(view, priors, replace(recipe.scene, moving_gaussians=0), recipe.motion, empty)
-    config = replace(recipe.fit, steps=recipe.fit.steps // 2, shadows=False, held_out_frames=0)
-    try:
-        distance = look_at_distance(empty.depth)
-        scene = replace(scene, near=NEAR * distance)
-        result = fit(scene, view, priors, config, empty=empty.rgb, distance=distance, seed=recipe.seed)
-    except EpisodeError as error:
-        logger.warning("shared background: %s; every episode fits its own", error)
-        return background
-    return replace(background, static=result.scene.static)
-
-
-def _no_tracks() -> PointTracks:
-    none = torch.zeros(0, 1)
-    return PointTracks(torch.zeros(0, 1, 2), none.bool(), none, torch.zeros(0, dtype=torch.long))
 
 
 def augment_episode(
@@ -209,49 +128,36 @@ def reconstruct(
     is that of one window. Windows share a background as episodes do. The last arguments are those of
     `estimate_priors`.
     """
-    windows = _windows(view, recipe)
-    if len(windows) > 1 and not backgrounds and recipe.scene.shared_background:
-        some = [shrink(few_frames(window), recipe.fit.max_width) for _, window in windows]
+    parts = windows(view, recipe)
+    if len(parts) > 1 and not backgrounds and recipe.scene.shared_background:
 
         def moving(number: int, frames: Tensor) -> Tensor:
-            return _moving_in_few(windows[number][1], recipe, frames, episode, key)
+            return moving_in_few(parts[number][1], recipe, frames, episode, key)
 
         with torch_on_one_thread():
-            backgrounds = [_fitted(background, recipe) for background in share_backgrounds(some, moving)]
-    beside = [[shrink(window, recipe.fit.max_width) for _, window in _windows(other, recipe)] for other in others]
+            backgrounds = share([shrink(few_frames(part), recipe.fit.max_width) for _, part in parts], moving, recipe)
+    beside = [[shrink(window, recipe.fit.max_width) for _, window in windows(other, recipe)] for other in others]
     fitted = []
-    for number, (_, window) in enumerate(windows):
+    for number, (_, window) in enumerate(parts):
 
         def within(share: float, done: int = number) -> object:
-            return progress((done + share) / len(windows))
+            return progress((done + share) / len(parts))
 
         priors_of = functools.partial(
             estimate_priors,
             config=recipe.priors,
             camera=recipe.camera,
-            others=[parts[number] for parts in beside],
+            others=[other[number] for other in beside],
             episode=episode,
             key=key,
             device=recipe.device,
         )
         fitted.append(_fit_window(shrink(window, recipe.fit.max_width), recipe, within, backgrounds, priors_of))
     results, known, distances, cameras = zip(*fitted, strict=True)
-    starts = tuple(start for start, _ in windows)
+    starts = tuple(start for start, _ in parts)
     camera = concatenated(cameras).resized(view.camera.width, view.camera.height)
     metric = all(priors.metric for priors in known)
     return Reconstruction(results, starts, metric, merged([p.provenance for p in known]), camera, distances[0])
-
-
-def _windows(view: View, recipe: Recipe) -> list[tuple[int, View]]:
-    """First frames and parts of a video, of about equal length; priors from a file are for the whole video."""
-    frames = len(view.rgb)
-    count = 1 if recipe.needs_whole_videos else -(-frames // recipe.fit.window_frames)
-    bounds = [round(i * frames / count) for i in range(count + 1)]
-    parts = []
-    for start, end in itertools.pairwise(bounds):
-        depth = None if view.depth is None else view.depth[start:end]
-        parts.append((start, View(view.rgb[start:end], view.camera.select(slice(start, end)), depth, view.depth_range)))
-    return parts
 
 
 def _fit_window(

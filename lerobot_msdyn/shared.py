@@ -55,11 +55,10 @@ class SharedBackground:
         return same and shift_px(picture.numpy(), self.empty.rgb.numpy()) < MAX_SHIFT_PX
 
 
-def share_backgrounds(views: list[View], moving: MovingIn) -> list[SharedBackground]:
-    """One background per place in which a camera stood, from some frames of several episodes; those alone are left out.
+def same_places(views: list[View]) -> list[list[int]]:
+    """Numbers of the videos that were taken from the same place, a list for each; those that are alone are left out.
 
-    Videos of moving cameras are left out as well. `moving` is asked what moves in the frames of a view, by its number,
-    and given those of all episodes that were taken from the same place.
+    Videos of moving cameras are left out as well.
     """
     groups: list[list[int]] = []
     pictures: list[UInt8[ndarray, "h w 3"]] = []
@@ -73,10 +72,14 @@ def share_backgrounds(views: list[View], moving: MovingIn) -> list[SharedBackgro
         else:
             groups.append([number])
             pictures.append(picture)
-    return [_shared([views[i] for i in group], group, moving) for group in groups if len(group) > 1]
+    return [group for group in groups if len(group) > 1]
 
 
-def _shared(views: list[View], numbers: list[int], moving: MovingIn) -> SharedBackground:
+def pooled(views: list[View], numbers: list[int], moving: MovingIn) -> SharedBackground:
+    """What some frames of several videos from one place show together.
+
+    `moving` is asked what moves in the frames of each view, by its number, and given the frames of all of them.
+    """
     frames = torch.cat([view.rgb for view in views])
     depths: list[Float[Tensor, "t h w"]] = []
     for view in views:
@@ -184,6 +187,24 @@ def shift_px(picture: UInt8[ndarray, "h w 3"], other: UInt8[ndarray, "i j 3"]) -
     window = cv2.createHanningWindow(first.shape[::-1], cv2.CV_32F)
     (dx, dy), _ = cv2.phaseCorrelate(first, second, window)
     return float(np.hypot(dx, dy))
+
+
+def as_arrays(background: SharedBackground) -> dict[str, ndarray]:
+    """A background for a file, without its frames and camera."""
+    tensors = dict(vars(background.empty))
+    if background.static is not None:
+        tensors |= {f"static.{name}": tensor for name, tensor in vars(background.static).items()}
+    return {name: tensor.numpy() for name, tensor in tensors.items()}
+
+
+def from_arrays(arrays: dict[str, ndarray], camera: CameraTrack, frames: UInt8[Tensor, "m h w 3"]) -> SharedBackground:
+    """What `as_arrays` gave, with its frames and camera."""
+    tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
+    empty = EmptyScene(*(tensors[item.name] for item in fields(EmptyScene)))
+    if "static.means" not in tensors:
+        return SharedBackground(empty, camera, frames)
+    static = Gaussians(*(tensors[f"static.{item.name}"] for item in fields(Gaussians)))
+    return SharedBackground(empty, camera, frames, static)
 
 
 def few(frames: int) -> list[int]:

@@ -18,6 +18,7 @@ ONLY_IN = {
         "video",
         "staging",
         "write",
+        "sharing",
         "pipeline",
         "estimate",
         "engines",

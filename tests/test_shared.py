@@ -13,10 +13,13 @@ from lerobot_msdyn.shared import (
     MovingIn,
     SharedBackground,
     adapted,
+    as_arrays,
     colour_match,
     completed,
     few_frames,
-    share_backgrounds,
+    from_arrays,
+    pooled,
+    same_places,
     shift_px,
 )
 
@@ -45,7 +48,7 @@ def moving(views: list[View], wall: np.ndarray) -> MovingIn:
 
 
 def shared_by(views: list[View], wall: np.ndarray) -> list[SharedBackground]:
-    return share_backgrounds(views, moving(views, wall))
+    return [pooled([views[i] for i in group], group, moving(views, wall)) for group in same_places(views)]
 
 
 def test_what_moves_is_no_background_though_most_episodes_show_it_at_the_same_place() -> None:
@@ -67,7 +70,7 @@ def test_a_camera_that_was_moved_has_its_own_background() -> None:
         episode(4, texture(1)),
     ]
     nothing = torch.zeros(FRAMES, HEIGHT, WIDTH, dtype=torch.uint8)
-    found = share_backgrounds(views, lambda number, frames: nothing)
+    found = [pooled([views[i] for i in group], group, lambda *_: nothing) for group in same_places(views)]
     assert len(found) == 2
     assert [group.fits(views[0]) for group in found] == [True, False]
     assert [group.fits(views[2]) for group in found] == [False, True]
@@ -150,3 +153,15 @@ def test_few_frames_of_a_long_video() -> None:
     )
     assert len(few_frames(long).rgb) == 20
     assert len(few_frames(view).rgb) == FRAMES
+
+
+def test_a_background_comes_back_from_its_arrays() -> None:
+    view = episode(4, texture())
+    (shared,) = shared_by([view, episode(20, texture())], texture())
+    static = background_gaussians(shared.empty.rgb, shared.empty.depth, view.camera, 10_000)
+    for known in (shared, dataclasses.replace(shared, static=static)):
+        again = from_arrays(as_arrays(known), known.camera, known.frames)
+        assert torch.equal(again.empty.rgb, known.empty.rgb)
+        assert (again.static is None) == (known.static is None)
+        if again.static is not None:
+            assert torch.equal(again.static.sh, static.sh)

@@ -45,7 +45,9 @@ class PriorCache:
         """
         if self.folder is None:
             return compute()
-        content = json.dumps({"settings": settings, "code": _code_digest()}, sort_keys=True, default=str)
+        content = json.dumps(
+            {"settings": settings, "code": code_digest(Path(__file__).parent)}, sort_keys=True, default=str
+        )
         path = self.folder / f"{prior}-{provider}-{_digest(content.encode())}.npz"
         found = _read(path)
         if found is not None:
@@ -112,9 +114,9 @@ def save_npz(path: Path, arrays: Arrays) -> None:
 
 
 @functools.cache
-def _code_digest() -> str:
-    """Changes whenever a module of this folder does."""
-    return _digest(*(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py"))))
+def code_digest(folder: Path) -> str:
+    """Changes whenever a module in a folder does."""
+    return _digest(*(path.read_bytes() for path in sorted(folder.rglob("*.py"))))
 
 
 def _digest(*parts: bytes | memoryview) -> str:
