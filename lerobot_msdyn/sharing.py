@@ -49,8 +49,7 @@ def shared_backgrounds(source: LeRobotDatasetMetadata, cameras: list[str], recip
     if not recipe.scene.shared_background or source.total_episodes < 2:
         return {}
     views: dict[str, dict[int, View]] = {key: {} for key in cameras}  # by episode
-    count = min(MAX_EPISODES, source.total_episodes)
-    for index in sorted({round(i * (source.total_episodes - 1) / (count - 1)) for i in range(count)}):
+    for index in looked_at(source.total_episodes):
         with contextlib.suppress(EpisodeError):
             episode = read_episode(source, index, cameras, recipe.camera, recorded_depth=recipe.priors.depth != "plane")
             for key, view in episode.views.items():
@@ -70,6 +69,12 @@ def shared_backgrounds(source: LeRobotDatasetMetadata, cameras: list[str], recip
         with torch_on_one_thread():
             found[key] = share(list(some.values()), moving, recipe)
     return found
+
+
+def looked_at(episodes: int) -> list[int]:
+    """Indices of those of a dataset's two or more episodes that are looked at."""
+    count = min(MAX_EPISODES, episodes)
+    return sorted({round(i * (episodes - 1) / (count - 1)) for i in range(count)})
 
 
 def share(views: list[View], moving: MovingIn, recipe: Recipe) -> list[SharedBackground]:
