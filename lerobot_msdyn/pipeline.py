@@ -30,6 +30,7 @@ from lerobot_msdyn.shared import (
     few_frames,
 )
 from lerobot_msdyn.sharing import NEAR, Backgrounds, moving_in_few, share, windows
+from lerobot_msdyn.unexplained import unexplained
 from lerobot_msdyn.write import NewEpisode, OutputDataset
 
 logger = logging.getLogger(__name__)
@@ -197,6 +198,8 @@ def _fit_window(
             seed=recipe.seed,
             progress=lambda done: progress(done / steps),
         )
+        if settings.overlay:
+            result = replace(result, scene=replace(result.scene, overlay=unexplained(result.scene, view, priors)))
     return result, priors, distance, view.camera
 
 
