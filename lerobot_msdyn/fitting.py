@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from lerobot_msdyn.brightness import moving_gain, static_shading
@@ -63,6 +63,7 @@ def fit(
     priors: Priors,
     config: FitConfig,
     *,
+    empty: UInt8[Tensor, "h w 3"],
     distance: float,
     seed: int,
     backend: str = "auto",
@@ -75,6 +76,7 @@ def fit(
         view: the video, at the size at which it is fitted.
         priors: its priors, at the same size.
         config: steps, weights and learning rates.
+        empty: what the camera sees where nothing moves, by which brightness is measured.
         distance: distance to the look-at point (m), the unit of the means' learning rate.
         seed: fixes the order of the frames.
         backend: of the rasterizer.
@@ -85,7 +87,7 @@ def fit(
     """
     start = time.perf_counter()
     if config.shadows:
-        scene = replace(scene, shading=static_shading(scene.static, len(scene.moving), view, priors))
+        scene = replace(scene, shading=static_shading(scene.static, len(scene.moving), view, priors, empty))
     if config.sh_degree > 0:
         scene = replace(scene, moving=with_slope(scene.moving))
     scene, optimizer = _trainable(scene, config.learning_rates, distance)

@@ -26,8 +26,8 @@ class Reconstruction:
 
     results: tuple[FitResult, ...]
     starts: tuple[int, ...]  # first frame of each window
-    metric: bool  # whether depth is in true metres
-    provenance: dict[str, dict[str, str]]  # prior -> provider, why, model and licence, of the first window
+    metric: bool  # whether depth is in true metres, in all windows
+    provenance: dict[str, dict[str, str]]  # prior -> provider, why, model and licence, of all windows
     camera: CameraTrack  # at the size of the recorded video
     distance: float  # m, to the look-at point
     evidence: tuple[Evidence, ...]  # what the recorded camera showed in each window

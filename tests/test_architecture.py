@@ -19,6 +19,7 @@ ONLY_IN = {
         "video",
         "staging",
         "write",
+        "sharing",
         "pipeline",
         "estimate",
         "engines",

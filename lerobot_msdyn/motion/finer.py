@@ -11,8 +11,8 @@ from lerobot_msdyn.config import LevelName, MotionConfig
 from lerobot_msdyn.motion.bases import MotionLevel, with_idle
 from lerobot_msdyn.motion.binding import bind
 from lerobot_msdyn.motion.clusters import direction_features, displacement_features, filled, k_means, spread_nodes
-from lerobot_msdyn.motion.compose import compose
-from lerobot_msdyn.motion.follow import SceneMotion, unturned
+from lerobot_msdyn.motion.compose import compose_points
+from lerobot_msdyn.motion.follow import SceneMotion
 from lerobot_msdyn.motion.lift import LiftedTracks
 from lerobot_msdyn.motion.residual import (
     ResidualTracks,
@@ -134,7 +134,7 @@ def _gain(
 ) -> Float[Tensor, " n"]:
     """By how much a level lowers the root mean square error (m) of each track."""
     times = torch.arange(tracks.positions.shape[1])
-    moved, _ = compose(tracks.points, unturned(len(tracks.points)), (level,), (indices,), (logits,), times)
+    moved = compose_points(tracks.points, (level,), (indices,), (logits,), times)
     weights = tracks.weights * ((times - canonical).abs() > _CANONICAL_REACH)
     still = _root_mean_square(tracks.points[:, None] - tracks.positions, weights)
     return still - _root_mean_square(moved.transpose(0, 1) - tracks.positions, weights)
@@ -186,7 +186,7 @@ def _prediction(
         weights = tracks.weights[who][:, times] * ((times - frame).abs() > _QUERY_REACH)
         for motion, total in ((without, without_it), (with_level, with_it)):
             points, part = motion.to_canonical(seen.xyz[who, frame], frame, seen.instance[who])
-            moved, _ = motion.moved(points, part, times)
+            moved = motion.moved_points(points, part, times)
             total[here] += _root_mean_square(moved.transpose(0, 1) - seen.xyz[who][:, times], weights)
         count[here] += 1
     return without_it / count, (without_it - with_it) / count
