@@ -59,7 +59,7 @@ def timed(function: Callable, name: str, seconds: dict[str, float]) -> Callable:
 
 def measure(case: Case, recipe_name: str, steps: int | None, pipe: Connection) -> None:
     """Send the seconds of every stage and the peak of resident memory (MB)."""
-    from lerobot_msdyn import pipeline
+    from lerobot_msdyn import pipeline, views
     from lerobot_msdyn.cli import parse_config
     from lerobot_msdyn.config import AugmentConfig
     from lerobot_msdyn.episode import open_source
@@ -83,7 +83,7 @@ def measure(case: Case, recipe_name: str, steps: int | None, pipe: Connection) -
         key = "observation.images.front"
         share = timed(pipeline.shared_backgrounds, "shared background", seconds)
         read = timed(pipeline.read_episode, "read", seconds)
-        render = timed(lambda scene, camera: list(pipeline.new_pictures(scene, camera)), "render", seconds)
+        render = timed(lambda scene, camera: list(views.new_pictures(scene, camera)), "render", seconds)
         backgrounds = share(source, [key], recipe)
         pipeline.estimate_priors = timed(pipeline.estimate_priors, "priors", seconds)
         pipeline.initialise = timed(pipeline.initialise, "initial scene", seconds)

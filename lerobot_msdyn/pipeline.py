@@ -5,17 +5,16 @@ import functools
 import itertools
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float32, UInt8
 from lerobot.datasets import LeRobotDatasetMetadata
-from torch import Tensor
 
 from lerobot_msdyn.background import empty_scene
-from lerobot_msdyn.cameras import CameraTrack, concatenated
+from lerobot_msdyn.cameras import concatenated
 from lerobot_msdyn.config import Recipe, SceneConfig
+from lerobot_msdyn.coverage import Evidence, evidence_of
 from lerobot_msdyn.episode import View, depth_key_of, read_episode, shrink
 from lerobot_msdyn.errors import EpisodeError
 from lerobot_msdyn.fitting import FitResult, fit
@@ -23,8 +22,6 @@ from lerobot_msdyn.initialisation import initialise
 from lerobot_msdyn.perturbation import draw_offset, draw_rng, look_at_distance, perturb
 from lerobot_msdyn.priors import PointTracks, Priors, estimate_priors
 from lerobot_msdyn.provenance import SOURCE_VARIANT, Provenance
-from lerobot_msdyn.quality import HOLE_ALPHA, fill_holes
-from lerobot_msdyn.rendering import render_frames
 from lerobot_msdyn.shared import (
     MAX_EPISODES,
     SharedBackground,
@@ -33,6 +30,7 @@ from lerobot_msdyn.shared import (
     few_frames,
     share_backgrounds,
 )
+from lerobot_msdyn.views import Picture, Reconstruction, new_pictures
 from lerobot_msdyn.write import NewEpisode, OutputDataset
 
 logger = logging.getLogger(__name__)
@@ -44,31 +42,6 @@ FURTHER_STEPS = 0.6  # share of the fit's steps that suffices where the static s
 
 Backgrounds = Mapping[str, Sequence[SharedBackground]]  # by camera
 Progress = Callable[[str, float], object]  # (what is being done, share of the episode done since the last call)
-
-
-@dataclass(frozen=True)
-class Reconstruction:
-    """One camera's scenes, one per window of its video, and what was known about it."""
-
-    results: tuple[FitResult, ...]
-    starts: tuple[int, ...]  # first frame of each window
-    metric: bool  # whether depth is in true metres
-    provenance: dict[str, dict[str, str]]  # prior -> provider, why, model and licence, of the first window
-    camera: CameraTrack  # at the size of the recorded video
-    distance: float  # m, to the look-at point
-
-    @property
-    def seconds(self) -> float:
-        """Time that was spent in fitting."""
-        return sum(result.seconds for result in self.results)
-
-
-@dataclass(frozen=True)
-class Picture:
-    """One frame of a new view."""
-
-    rgb: UInt8[np.ndarray, "h w 3"]
-    depth: Float32[np.ndarray, "h w"]  # m, z-depth; 0 where nothing is known, and everywhere if there is no true scale
 
 
 def shared_backgrounds(source: LeRobotDatasetMetadata, cameras: list[str], recipe: Recipe) -> Backgrounds:
@@ -195,10 +168,10 @@ def reconstruct(
             device=recipe.device,
         )
         fitted.append(_fit_window(shrink(window, recipe.fit.max_width), recipe, within, backgrounds, priors_of))
-    results, known, distances, cameras = zip(*fitted, strict=True)
+    results, known, distances, evidence = zip(*fitted, strict=True)
     starts = tuple(start for start, _ in windows)
-    camera = concatenated(cameras).resized(view.camera.width, view.camera.height)
-    return Reconstruction(results, starts, known[0].metric, known[0].provenance, camera, distances[0])
+    camera = concatenated([part.camera for part in evidence]).resized(view.camera.width, view.camera.height)
+    return Reconstruction(results, starts, known[0].metric, known[0].provenance, camera, distances[0], evidence)
 
 
 def _windows(view: View, recipe: Recipe) -> list[tuple[int, View]]:
@@ -219,8 +192,8 @@ def _fit_window(
     progress: Callable[[float], object],
     backgrounds: Sequence[SharedBackground],
     priors_of: Callable[..., Priors],
-) -> tuple[FitResult, Priors, float, CameraTrack]:
-    """A fitted scene of one window at the size at which it is fitted, its priors, look-at distance (m) and camera."""
+) -> tuple[FitResult, Priors, float, Evidence]:
+    """A fitted scene of one window, its priors, look-at distance (m) and what was recorded, at the size of the fit."""
     steps, settings = recipe.fit.steps, recipe.scene
     with _one_torch_thread():
         shared = next((background for background in backgrounds if background.fits(view)), None)
@@ -250,7 +223,7 @@ def _fit_window(
         seed=recipe.seed,
         progress=lambda done: progress(done / steps),
     )
-    return result, priors, distance, view.camera
+    return result, priors, distance, evidence_of(result.scene, view.camera, empty)
 
 
 def _for_rough_depth(scene: SceneConfig) -> SceneConfig:
@@ -285,25 +258,3 @@ def by_feature(
             if depth_key is not None:
                 features[depth_key] = picture.depth
         yield features
-
-
-def new_pictures(scene: Reconstruction, camera: CameraTrack, frames: Tensor | None = None) -> Iterator[Picture]:
-    """The scene through another camera, holes filled; the share of holes is logged at the end.
-
-    `frames` (int, [t]) are those that the poses of `camera` belong to; default: all.
-    """
-    frames = torch.arange(len(scene.camera)) if frames is None else frames
-    window = torch.searchsorted(torch.tensor(scene.starts), frames, right=True) - 1
-    holes: list[float] = []
-    for index, count in zip(
-        *(values.tolist() for values in window.unique_consecutive(return_counts=True)), strict=True
-    ):
-        part = slice(len(holes), len(holes) + count)
-        result, times = scene.results[index], frames[part] - scene.starts[index]
-        for rendering in render_frames(result.scene, camera.select(part), times):
-            drawn = (rendering.rgb.clamp(0, 1) * 255).round().to(torch.uint8)
-            for rgb, alpha, depth in zip(drawn.numpy(), rendering.alpha.numpy(), rendering.depth.numpy(), strict=True):
-                filled, share = fill_holes(rgb, alpha)
-                holes.append(share)
-                yield Picture(filled, np.where((alpha >= HOLE_ALPHA) & scene.metric, depth, np.float32(0)))
-    logger.info("%.1f %% of the pixels were filled in (worst frame %.1f %%)", 100 * np.mean(holes), 100 * max(holes))

@@ -20,32 +20,52 @@ class Rendering:
     depth: Float[Tensor, "t h w"]  # m, expected z-depth; 0 where nothing is
     alpha: Float[Tensor, "t h w"]  # 0..1
     moving: Float[Tensor, "t h w"]  # 0..1, share of the moving set
+    extra: Float[Tensor, "t h w"] | None = None  # values of the moving Gaussians, blended like colours
 
 
-def draw(scene: DynamicScene, camera: CameraTrack, frames: Tensor, backend: str = "auto") -> Rendering:
-    """The scene at `frames` (int, [b]) through the b poses of `camera`; differentiable."""
+def draw(
+    scene: DynamicScene,
+    camera: CameraTrack,
+    frames: Tensor,
+    backend: str = "auto",
+    extra: Float[Tensor, " m"] | None = None,
+) -> Rendering:
+    """The scene at `frames` (int, [b]) through the b poses of `camera`; differentiable.
+
+    `extra` is a value per moving Gaussian to be drawn as well.
+    """
     snapshot = scene.at(frames, camera.world_from_camera[:, :3, 3])
+    drawn = (
+        [snapshot.moving] if extra is None else [snapshot.moving, torch.cat((torch.zeros(len(scene.static)), extra))]
+    )
     raster: Raster = rasterize(
         snapshot.means,
         snapshot.quats,
         snapshot.scales,
         snapshot.opacities,
-        torch.cat((snapshot.rgb, snapshot.moving[:, None].expand(len(frames), -1, 1)), dim=-1),
+        torch.cat((snapshot.rgb, torch.stack(drawn, dim=-1).expand(len(frames), -1, -1)), dim=-1),
         camera.camera_from_world,
         camera.intrinsics,
         camera.width,
         camera.height,
         backend=backend,
     )
-    return Rendering(raster.features[..., :3], raster.depth, raster.alpha, raster.features[..., 3])
+    rgb, moving, *more = raster.features.split([3] + [1] * len(drawn), dim=-1)
+    return Rendering(rgb, raster.depth, raster.alpha, moving[..., 0], more[0][..., 0] if more else None)
 
 
 @torch.no_grad()
 def render_frames(
-    scene: DynamicScene, camera: CameraTrack, frames: Tensor | None = None, *, batch: int = 8, backend: str = "auto"
+    scene: DynamicScene,
+    camera: CameraTrack,
+    frames: Tensor | None = None,
+    *,
+    batch: int = 8,
+    backend: str = "auto",
+    extra: Float[Tensor, " m"] | None = None,
 ) -> Iterator[Rendering]:
     """The whole scene in batches of frames, so that memory stays bounded; `frames` (int, [t]) defaults to all."""
     frames = torch.arange(scene.frames) if frames is None else frames
     for start in range(0, len(frames), batch):
         part = slice(start, min(start + batch, len(frames)))
-        yield draw(scene, camera.select(part), frames[part], backend)
+        yield draw(scene, camera.select(part), frames[part], backend, extra)

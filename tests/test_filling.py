@@ -1,8 +1,8 @@
-"""Holes in new pictures."""
+"""What stands where nobody has seen anything."""
 
 import numpy as np
 
-from lerobot_msdyn.quality import fill_holes
+from lerobot_msdyn.filling import fill_holes
 
 
 def test_holes_are_filled_from_their_borders_and_counted() -> None:
