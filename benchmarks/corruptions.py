@@ -32,7 +32,7 @@ class Case:
 
 
 def read_clip(folder: Path, stride: int, width: int) -> View:
-    """Every `stride`-th frame of a simulated episode with recorded depth and its true camera, at most `width` px wide."""
+    """Every `stride`-th frame of a simulated episode with its recorded depth and true camera, at `width` px or less."""
     source = open_source(f"local/{folder.name}", folder / "dataset_depth")
     key = select_cameras(source, None)[0]
     view = read_episode(source, 0, [key], Recipe().camera).views[key]

@@ -13,9 +13,9 @@ from lerobot_msdyn.errors import ConfigError
 from lerobot_msdyn.geometry import axis_angle_to_matrix, se3
 
 
-def draw_rng(seed: int, episode: int, variant: int) -> np.random.Generator:
+def draw_rng(seed: int, episode: int, variant: int, attempt: int = 0) -> np.random.Generator:
     """The random numbers of one new episode, the same whatever else is computed before or beside it."""
-    return np.random.default_rng([seed, episode, variant])
+    return np.random.default_rng([seed, episode, variant] + [attempt] * (attempt > 0))
 
 
 def look_at_distance(depth: Float[Tensor, "h w"]) -> float:

@@ -4,24 +4,29 @@ import contextlib
 import functools
 import itertools
 import logging
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
 
 from lerobot_msdyn.background import empty_scene
-from lerobot_msdyn.cameras import concatenated
+from lerobot_msdyn.cameras import CameraTrack, concatenated
 from lerobot_msdyn.config import Recipe, SceneConfig
 from lerobot_msdyn.coverage import Evidence, evidence_of
 from lerobot_msdyn.episode import View, depth_key_of, read_episode, shrink
 from lerobot_msdyn.errors import EpisodeError
 from lerobot_msdyn.fitting import FitResult, fit
+from lerobot_msdyn.geometry import invert_se3
 from lerobot_msdyn.initialisation import initialise
 from lerobot_msdyn.perturbation import draw_offset, draw_rng, look_at_distance, perturb
 from lerobot_msdyn.priors import PointTracks, Priors, estimate_priors
 from lerobot_msdyn.provenance import SOURCE_VARIANT, Provenance
+from lerobot_msdyn.quality.verdict import judge, reasons, record
+from lerobot_msdyn.quality.witness import Witness, witness
 from lerobot_msdyn.shared import (
     MAX_EPISODES,
     SharedBackground,
@@ -120,15 +125,47 @@ def augment_episode(
         new.append(NewEpisode(index, Provenance(source.repo_id, index, SOURCE_VARIANT, recipe.seed, {}, priors)))
     for variant in range(recipe.variants):
         progress(f"episode {index}: rendering variant {variant}", 0.0)
-        rng = draw_rng(recipe.seed, index, variant)
-        pictures, drawn = {}, {}
-        for key, scene in scenes.items():
-            offset, drawn[key] = draw_offset(recipe.perturbation, scene.distance, rng)
-            pictures[key] = new_pictures(scene, perturb(scene.camera, offset))
-        provenance = Provenance(source.repo_id, index, variant, recipe.seed, drawn, priors)
-        new.append(output.stage(index, variant, by_feature(source, pictures), provenance))
+        drawn, cameras_new, gate = _drawn_and_judged(scenes, recipe, index, variant)
+        provenance = Provenance(source.repo_id, index, variant, recipe.seed, drawn, priors, gate)
+        if gate["dropped"]:
+            logger.warning("episode %d variant %d: dropped: %s", index, variant, gate["dropped"])
+            new.append(NewEpisode(index, provenance, dropped=gate["dropped"]))
+        else:
+            pictures = {key: new_pictures(scene, cameras_new[key]) for key, scene in scenes.items()}
+            new.append(output.stage(index, variant, by_feature(source, pictures), provenance))
         progress("", 0.5 / recipe.variants)
     return new
+
+
+def _drawn_and_judged(
+    scenes: Mapping[str, Reconstruction], recipe: Recipe, index: int, variant: int
+) -> tuple[dict[str, dict[str, float]], dict[str, CameraTrack], dict[str, Any]]:
+    """What is drawn for one new episode, its cameras, and the gate's record; drawn again where the gate rejects it."""
+    start = time.perf_counter()
+    rejected: list[str] = []
+    for attempt in range(recipe.gate.redraws + 1):
+        rng = draw_rng(recipe.seed, index, variant, attempt)
+        drawn: dict[str, dict[str, float]] = {}
+        cameras, views, why = {}, {}, []
+        for key, scene in scenes.items():
+            offset, drawn[key] = draw_offset(recipe.perturbation, scene.distance, rng)
+            cameras[key] = perturb(scene.camera, offset)
+            views[key] = {"camera_from_source": invert_se3(offset).tolist(), "distance": scene.distance}
+            if recipe.gate.enabled:
+                scores = judge(scene.windows, cameras[key])
+                views[key]["scores"] = record(scores)
+                why += [f"{key}: {reason}" for reason in reasons(scores, recipe.gate)]
+        if not why:
+            break
+        rejected.append("; ".join(why))
+    gate = {
+        "views": views,
+        "rejected": rejected,
+        "dropped": rejected[-1] if len(rejected) > recipe.gate.redraws else "",
+        "fit_seconds": {key: round(scene.seconds, 1) for key, scene in scenes.items()},
+        "gate_seconds": round(time.perf_counter() - start, 1),
+    }
+    return drawn, cameras, gate
 
 
 def reconstruct(
@@ -168,10 +205,11 @@ def reconstruct(
             device=recipe.device,
         )
         fitted.append(_fit_window(shrink(window, recipe.fit.max_width), recipe, within, backgrounds, priors_of))
-    results, known, distances, evidence = zip(*fitted, strict=True)
+    results, known, distances, evidence, witnesses = zip(*fitted, strict=True)
     starts = tuple(start for start, _ in windows)
     camera = concatenated([part.camera for part in evidence]).resized(view.camera.width, view.camera.height)
-    return Reconstruction(results, starts, known[0].metric, known[0].provenance, camera, distances[0], evidence)
+    metric, origin = known[0].metric, known[0].provenance
+    return Reconstruction(results, starts, metric, origin, camera, distances[0], evidence, witnesses)
 
 
 def _windows(view: View, recipe: Recipe) -> list[tuple[int, View]]:
@@ -192,8 +230,8 @@ def _fit_window(
     progress: Callable[[float], object],
     backgrounds: Sequence[SharedBackground],
     priors_of: Callable[..., Priors],
-) -> tuple[FitResult, Priors, float, Evidence]:
-    """A fitted scene of one window, its priors, look-at distance (m) and what was recorded, at the size of the fit."""
+) -> tuple[FitResult, Priors, float, Evidence, Witness]:
+    """A fitted scene of one window, its priors, look-at distance (m), what was recorded, and how well that is met."""
     steps, settings = recipe.fit.steps, recipe.scene
     with _one_torch_thread():
         shared = next((background for background in backgrounds if background.fits(view)), None)
@@ -223,7 +261,8 @@ def _fit_window(
         seed=recipe.seed,
         progress=lambda done: progress(done / steps),
     )
-    return result, priors, distance, evidence_of(result.scene, view.camera, empty)
+    seen = evidence_of(result.scene, view.camera, empty)
+    return result, priors, distance, seen, witness(result.scene, view, priors, result.held_out)
 
 
 def _for_rough_depth(scene: SceneConfig) -> SceneConfig:

@@ -4,6 +4,7 @@ import importlib.metadata
 import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -24,6 +25,7 @@ class Provenance:
     priors: dict[str, dict[str, dict[str, str]]] = field(
         default_factory=dict
     )  # camera -> prior -> provider, why, model
+    gate: dict[str, Any] = field(default_factory=dict)  # "scores", "rejected", "seconds", see docs/quality.md
 
 
 def write_provenance(root: Path, episodes: list[Provenance], recipe_yaml: str) -> None:

@@ -43,6 +43,7 @@ class NewEpisode:
     source_index: int
     provenance: Provenance
     pictures: StagedPictures = field(default_factory=StagedPictures)  # none for a copy of the source's episode
+    dropped: str = ""  # why there is no such episode in the end: the gate's reason
 
 
 class OutputDataset:

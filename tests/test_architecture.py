@@ -21,6 +21,7 @@ ONLY_IN = {
         "pipeline",
         "estimate",
         "engines",
+        "report",
         "augment",
         "evaluate",
         "training",
