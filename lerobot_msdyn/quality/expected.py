@@ -15,7 +15,7 @@ from lerobot_msdyn.cameras import CameraTrack
 from lerobot_msdyn.geometry import pixel_grid, project, transform_points, unproject
 from lerobot_msdyn.quality.witness import Witness, decibels
 
-FINEST_PX = 0.35  # points are placed no better than this
+FINEST_PX = 12**-0.5  # along each axis, by which a point is off that lies anywhere within a pixel: (1/12)^(1/2)
 BETWEEN = 0.5  # where two depths disagree, the truth is taken to lie in the middle
 
 
@@ -26,7 +26,7 @@ class Expected:
     video: Float[Tensor, " t"]  # as in the recorded view
     geometry: Float[Tensor, " t"]  # the scene's depth is not the prior's
     depth: Float[Tensor, " t"]  # the prior's depth is not the truth, as far as its provider is known to err
-    sampling: Float[Tensor, " t"]  # points are placed no better than FINEST_PX
+    sampling: Float[Tensor, " t"]  # a point may lie anywhere within its pixel
 
     @property
     def total(self) -> Float[Tensor, " t"]:
@@ -58,12 +58,12 @@ def expected_error(witness: Witness, new: CameraTrack) -> Expected:
     place = _seen_from(camera, new, prior)
     drawn = (_seen_from(camera, new, witness.drawn_depth) - place) * BETWEEN
     unsure = _seen_from(camera, new, prior * (1 + witness.depth_error)) - place
-    half = torch.full_like(drawn, FINEST_PX / 2**0.5)
+    within = torch.full_like(drawn, FINEST_PX)
     return Expected(
         witness.error,
         _misplaced(witness.recorded, drawn * (known & (witness.drawn_depth > 0))[..., None]),
         _misplaced(witness.recorded, unsure * (prior > 0)[..., None]),
-        _misplaced(witness.recorded, half),
+        _misplaced(witness.recorded, within),
     )
 
 

@@ -31,13 +31,12 @@ def cameras_from_above(cameras_from_source: Sequence[Sequence[Sequence[float]]],
         place = pose[[0, 2], 3]
         ahead = place + pose[[0, 2], 2] * distance
         return (
-            f'<line class="sight {kind}" x1="{at(place).split(",")[0]}" y1="{at(place).split(",")[1]}" '
-            f'x2="{at(ahead).split(",")[0]}" y2="{at(ahead).split(",")[1]}"/>'
+            f'<polyline class="sight {kind}" points="{at(place)} {at(ahead)}"/>'
             f'<polygon class="{kind}" points="{" ".join(at(corner) for corner in _triangle(pose, distance))}"/>'
         )
 
     x, y = at(np.array([0, distance])).split(",")
-    drawn = camera(np.eye(4), "recorded") + "".join(camera(pose, "new") for pose in new)
+    drawn = "".join(camera(pose, "new") for pose in new) + camera(np.eye(4), "recorded")
     return (
         f'<svg viewBox="0 0 {SIZE} {SIZE}" role="img" aria-label="camera poses from above">{drawn}'
         f'<circle class="target" cx="{x}" cy="{y}" r="4"/></svg>'

@@ -16,33 +16,35 @@ main{max-width:1180px;margin:0 auto;padding:24px 20px 60px}
 h1{font-size:26px;line-height:1.25;margin:0 0 4px}h2{font-size:20px;margin:36px 0 12px}
 h3{font-size:16px;margin:0;overflow-wrap:anywhere}
 p{margin:0 0 10px}.soft{color:var(--soft)}
-.figures{display:flex;flex-wrap:wrap;gap:12px;margin:18px 0}
-.figures div{background:var(--paper);border:1px solid var(--line);border-radius:8px;padding:10px 16px;min-width:128px}
+.figures{display:grid;grid-template-columns:repeat(auto-fit,minmax(128px,1fr));gap:12px;margin:18px 0}
+.figures div{background:var(--paper);border:1px solid var(--line);border-radius:8px;padding:10px 14px}
 .figures b{display:block;font-size:22px;font-weight:600}
 article{background:var(--paper);border:1px solid var(--line);border-radius:8px;padding:16px;margin:0 0 18px}
 .head{display:flex;flex-wrap:wrap;gap:4px 14px;align-items:baseline;justify-content:space-between;margin-bottom:12px}
 .score{font-weight:600;color:var(--good)}.dropped .score,.why{color:var(--new)}
 .grid{display:grid;grid-template-columns:2fr 1fr 1fr;gap:16px;margin-top:14px;align-items:start}
 figure{margin:0;min-width:0}figcaption{color:var(--soft);font-size:13px;margin-top:4px}
-img,svg{display:block;max-width:100%;height:auto;border-radius:4px}.strip img{width:100%}
+img,svg{display:block;width:100%;height:auto;border-radius:4px}
 .film{width:100%;background-size:calc(100% * var(--frames)) 100%;border-radius:4px;
 animation:film calc(var(--frames) * .16s) steps(var(--frames),jump-none) infinite}
 @keyframes film{from{background-position:0 0}to{background-position:100% 0}}
 @media (prefers-reduced-motion:reduce){.film{animation:none}}
-svg{background:var(--back);width:100%}
+svg{background:var(--back)}
 svg .recorded{fill:#8b95a3;stroke:#8b95a3}svg .new{fill:var(--new);stroke:var(--new)}
+svg polygon.recorded{fill:none;stroke-width:2}
 svg .sight{stroke-width:1;stroke-dasharray:3 4;opacity:.6}svg .target{fill:none;stroke:var(--ink);stroke-width:1.5}
 .scroll{overflow-x:auto}
 table{border-collapse:collapse;width:100%;font-size:14px;background:var(--paper)}
 th,td{text-align:left;padding:6px 10px;border-bottom:1px solid var(--line);white-space:nowrap}
 td.text{white-space:normal;min-width:220px;overflow-wrap:anywhere}
 th{color:var(--soft);font-weight:600}
-dl{display:grid;grid-template-columns:repeat(auto-fill,minmax(170px,1fr));gap:8px 16px;margin:14px 0 0}
+dl{display:grid;grid-template-columns:repeat(auto-fill,minmax(136px,1fr));gap:8px 16px;margin:14px 0 0}
+dl .wide{grid-column:span 2}
 dt{color:var(--soft);font-size:13px}dd{margin:0;font-weight:600}
 ul{margin:8px 0 0;padding-left:20px}li{overflow-wrap:anywhere}
 details{margin-top:12px}summary{cursor:pointer;color:var(--soft)}
-@media (max-width:760px){main{padding:16px 12px 40px}h1{font-size:22px}.grid{grid-template-columns:1fr}
-.figures div{flex:1 1 40%}article{padding:12px}}
+@media (max-width:760px){main{padding:16px 12px 40px}h1{font-size:22px}.grid{grid-template-columns:1fr 1fr}
+.grid figure:first-child{grid-column:span 2}article{padding:12px}}
 """
 # Score -> (name, how it is written).
 NAMES = {
@@ -142,7 +144,7 @@ def _article(entry: ViewEntry) -> str:
 
 
 def _pictures(entry: ViewEntry) -> str:
-    change = ", ".join(f"{text(name.replace('_', ' '))} {value:.3g}" for name, value in entry.drawn.items())
+    change = text(", ".join(_with_unit(name, value) for name, value in entry.drawn.items()))
     above = (
         f"<figure>{cameras_from_above([entry.view['camera_from_source']], entry.view['distance'])}"
         f"<figcaption>From above: recorded camera grey, new one red. {change}</figcaption></figure>"
@@ -165,12 +167,20 @@ def _pictures(entry: ViewEntry) -> str:
     )
 
 
+def _with_unit(name: str, value: float) -> str:
+    """What was drawn, in words: its name ends in its unit."""
+    for ending, unit in (("_deg", "°"), ("_m", " m"), ("_rel", " of the distance")):
+        if name.endswith(ending):
+            return f"{name.removesuffix(ending).replace('_', ' ')} {value:.3g}{unit}"
+    return f"{name.replace('_', ' ')} {value:.3g}"
+
+
 def _scores(scores: dict[str, Any]) -> str:
     items = "".join(
         f"<div><dt>{name}</dt><dd>{text(form.format(scores[key]))}</dd></div>" for key, (name, form) in NAMES.items()
     )
     cause = ", ".join(f"{name} {share:.0%}" for name, share in scores["causes"].items())
-    return f'<dl>{items}<div><dt>expected error from</dt><dd class="soft">{text(cause)}</dd></div></dl>'
+    return f'<dl>{items}<div class="wide"><dt>expected error from</dt><dd class="soft">{text(cause)}</dd></div></dl>'
 
 
 def _frames(frames: Sequence[dict[str, float]]) -> str:
