@@ -32,11 +32,14 @@ def run(arguments: list[str]) -> int:
     # LeRobot and torch take seconds to import: only now, so that --help and bad flags are answered at once.
     from lerobot.utils.constants import HF_LEROBOT_HOME
 
+    from lerobot_msdyn.action_safety import still_cameras
     from lerobot_msdyn.episode import open_source, select_cameras, select_episodes
 
     source = open_source(config.repo_id, config.root)
     episodes = select_episodes(source, config.episodes)
-    cameras = select_cameras(source, config.cameras)
+    cameras = select_cameras(source, config.cameras, allow_moving=config.allow_moving)
+    if not config.allow_moving:
+        cameras = still_cameras(source, episodes[0], cameras, config)
     new_repo_id = config.new_repo_id or f"{config.repo_id}_msdyn"
     new_root = config.new_root
     if new_root is None and config.root is not None and config.new_repo_id is None:

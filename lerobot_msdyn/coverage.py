@@ -111,3 +111,12 @@ def _in_front(
         farthest = torch.maximum(farthest, depth[row, column])
         most = torch.maximum(most, value[row, column].float())
     return torch.where(inside & (z <= farthest * (1 + BEHIND)), most, 0).long()
+
+
+def is_behind(evidence: Evidence, places: Float[Tensor, "n 3"]) -> bool:
+    """Whether any of some places (m, world) is behind what stands still before the recorded camera."""
+    camera = evidence.camera.select([0])
+    xy, z = project(transform_points(camera.camera_from_world[0], places), camera.intrinsics[0])
+    inside = (z > 0) & (xy >= 0).all(-1) & (xy[:, 0] < camera.width) & (xy[:, 1] < camera.height)
+    column, row = xy[inside].long().unbind(-1)
+    return bool((z[inside] > evidence.depth[row, column]).any())

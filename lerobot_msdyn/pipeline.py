@@ -12,19 +12,20 @@ from typing import Any
 import numpy as np
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
+from torch import Tensor
 
 from lerobot_msdyn.background import empty_scene
-from lerobot_msdyn.cameras import CameraTrack, concatenated
-from lerobot_msdyn.config import Recipe, SceneConfig
+from lerobot_msdyn.bounds import NewCameras, new_cameras
+from lerobot_msdyn.cameras import concatenated, read_calibration
+from lerobot_msdyn.config import OtherCameraConfig, Recipe, SceneConfig
 from lerobot_msdyn.coverage import Evidence, evidence_of
 from lerobot_msdyn.episode import View, depth_key_of, read_episode, shrink
-from lerobot_msdyn.errors import EpisodeError
+from lerobot_msdyn.errors import ConfigError, EpisodeError
 from lerobot_msdyn.fitting import FitResult, fit
-from lerobot_msdyn.geometry import invert_se3
 from lerobot_msdyn.initialisation import initialise
-from lerobot_msdyn.perturbation import draw_offset, draw_rng, look_at_distance, perturb
+from lerobot_msdyn.perturbation import look_at_distance
 from lerobot_msdyn.priors import PointTracks, Priors, estimate_priors
-from lerobot_msdyn.provenance import SOURCE_VARIANT, Provenance
+from lerobot_msdyn.provenance import SOURCE_VARIANT, Provenance, camera_pose
 from lerobot_msdyn.quality.verdict import judge, reasons, record
 from lerobot_msdyn.quality.witness import Witness, witness
 from lerobot_msdyn.shared import (
@@ -35,7 +36,7 @@ from lerobot_msdyn.shared import (
     few_frames,
     share_backgrounds,
 )
-from lerobot_msdyn.views import Picture, Reconstruction, new_pictures
+from lerobot_msdyn.views import Picture, Reconstruction, UnseenMasks, new_pictures
 from lerobot_msdyn.write import NewEpisode, OutputDataset
 
 logger = logging.getLogger(__name__)
@@ -120,52 +121,92 @@ def augment_episode(
             key=key,
         )
     priors = {key: scene.provenance for key, scene in scenes.items()}
+    other = _other_pose(recipe, index, episode.views[cameras[0]])
     new = []
     if recipe.include_source:
         new.append(NewEpisode(index, Provenance(source.repo_id, index, SOURCE_VARIANT, recipe.seed, {}, priors)))
     for variant in range(recipe.variants):
         progress(f"episode {index}: rendering variant {variant}", 0.0)
-        drawn, cameras_new, gate = _drawn_and_judged(scenes, recipe, index, variant)
-        provenance = Provenance(source.repo_id, index, variant, recipe.seed, drawn, priors, gate)
-        if gate["dropped"]:
-            logger.warning("episode %d variant %d: dropped: %s", index, variant, gate["dropped"])
-            new.append(NewEpisode(index, provenance, dropped=gate["dropped"]))
-        else:
-            pictures = {key: new_pictures(scene, cameras_new[key]) for key, scene in scenes.items()}
-            new.append(output.stage(index, variant, by_feature(source, pictures), provenance))
+        found, gate = _accepted(scenes, recipe, index, variant, other)
+        new.append(_staged(source, index, variant, recipe, output, scenes, found, gate))
         progress("", 0.5 / recipe.variants)
     return new
 
 
-def _drawn_and_judged(
-    scenes: Mapping[str, Reconstruction], recipe: Recipe, index: int, variant: int
-) -> tuple[dict[str, dict[str, float]], dict[str, CameraTrack], dict[str, Any]]:
-    """What is drawn for one new episode, its cameras, and the gate's record; drawn again where the gate rejects it."""
+def _accepted(
+    scenes: Mapping[str, Reconstruction], recipe: Recipe, index: int, variant: int, other: Tensor | None
+) -> tuple[NewCameras, dict[str, Any]]:
+    """The cameras of one new episode, drawn again where they are rejected, and the gate's record."""
     start = time.perf_counter()
     rejected: list[str] = []
     for attempt in range(recipe.gate.redraws + 1):
-        rng = draw_rng(recipe.seed, index, variant, attempt)
-        drawn: dict[str, dict[str, float]] = {}
-        cameras, views, why = {}, {}, []
+        found = new_cameras(scenes, recipe, index, variant, attempt, other)
+        views: dict[str, dict[str, Any]] = {key: {"distance_m": scene.distance} for key, scene in scenes.items()}
+        why = [found.rejected] if found.rejected else []
         for key, scene in scenes.items():
-            offset, drawn[key] = draw_offset(recipe.perturbation, scene.distance, rng)
-            cameras[key] = perturb(scene.camera, offset)
-            views[key] = {"camera_from_source": invert_se3(offset).tolist(), "distance": scene.distance}
             if recipe.gate.enabled:
-                scores = judge(scene.windows, cameras[key])
+                scores = judge(scene.windows, found.cameras[key])
                 views[key]["scores"] = record(scores)
                 why += [f"{key}: {reason}" for reason in reasons(scores, recipe.gate)]
         if not why:
             break
         rejected.append("; ".join(why))
-    gate = {
+        logger.warning("episode %d variant %d, draw %d: rejected: %s", index, variant, attempt, rejected[-1])
+    return found, {
         "views": views,
         "rejected": rejected,
         "dropped": rejected[-1] if len(rejected) > recipe.gate.redraws else "",
         "fit_seconds": {key: round(scene.seconds, 1) for key, scene in scenes.items()},
         "gate_seconds": round(time.perf_counter() - start, 1),
     }
-    return drawn, cameras, gate
+
+
+def _staged(
+    source: LeRobotDatasetMetadata,
+    index: int,
+    variant: int,
+    recipe: Recipe,
+    output: OutputDataset,
+    scenes: Mapping[str, Reconstruction],
+    found: NewCameras,
+    gate: dict[str, Any],
+) -> NewEpisode:
+    """One new episode, rendered and encoded; nothing is rendered of one that was dropped."""
+    provenance = Provenance(
+        source.repo_id,
+        index,
+        variant,
+        recipe.seed,
+        found.drawn,
+        {key: scene.provenance for key, scene in scenes.items()},
+        {key: camera_pose(scene.camera, found.cameras[key]) for key, scene in scenes.items()},
+        gate,
+    )
+    if gate["dropped"]:
+        return NewEpisode(index, provenance, dropped=gate["dropped"])
+    pictures = {key: new_pictures(scene, found.cameras[key], fill=recipe.fill) for key, scene in scenes.items()}
+    masks = UnseenMasks() if recipe.masks else None
+    if masks is not None:
+        pictures = {key: masks.kept(key, some) for key, some in pictures.items()}
+    new = output.stage(index, variant, by_feature(source, pictures), provenance)
+    return new if masks is None else replace(new, masks=masks.arrays())
+
+
+def _other_pose(recipe: Recipe, index: int, view: View) -> Tensor | None:
+    """World from the camera that `other_camera` names."""
+    config = recipe.perturbation
+    if not isinstance(config, OtherCameraConfig):
+        return None
+    camera = None
+    if recipe.camera.calibration is not None:
+        height, width = view.rgb.shape[1:3]
+        camera = read_calibration(recipe.camera.calibration, config.camera, index, 1, width, height)
+    if camera is None:
+        raise ConfigError(
+            f"perturbation.camera is {config.camera!r}, which the calibration {recipe.camera.calibration} does not "
+            "name; expected a camera with K, R and t there (--camera.calibration FILE)"
+        )
+    return camera.world_from_camera[0]
 
 
 def reconstruct(

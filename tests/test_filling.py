@@ -1,22 +1,40 @@
 """What stands where nobody has seen anything."""
 
-import numpy as np
+import pytest
+import torch
 
-from lerobot_msdyn.filling import fill_holes
-
-
-def test_holes_are_filled_from_their_borders_and_counted() -> None:
-    rgb = np.full((20, 20, 3), 100, np.uint8)
-    alpha = np.ones((20, 20), np.float32)
-    rgb[5:9, 5:9], alpha[5:9, 5:9] = 0, 0.1
-    filled, share = fill_holes(rgb, alpha)
-    assert share == 16 / 400
-    assert (np.abs(filled.astype(int) - 100) <= 2).all()
+from lerobot_msdyn.filling import filled, missing
 
 
-def test_a_whole_picture_stays_as_it_is() -> None:
-    rgb = np.random.default_rng(0).integers(0, 255, (8, 8, 3), np.uint8)
-    for alpha in (np.ones((8, 8), np.float32), np.zeros((8, 8), np.float32)):
-        filled, share = fill_holes(rgb, alpha)
-        assert np.array_equal(filled, rgb)
-        assert share == 1 - alpha[0, 0]
+def beside_an_object() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """A grey wall at 1 m, a red object at 0.6 m before it, and a hole along the object's right side."""
+    rgb, depth, alpha = torch.full((40, 60, 3), 0.5), torch.full((40, 60), 1.0), torch.ones(40, 60)
+    rgb[10:30, 10:30], depth[10:30, 10:30] = torch.tensor([0.9, 0.0, 0.0]), 0.6
+    hole = (slice(10, 30), slice(30, 36))
+    rgb[hole], depth[hole], alpha[hole] = 0.0, 0.0, 0.0
+    return rgb, alpha, depth
+
+
+@pytest.mark.parametrize("fill", ["inpaint", "nearest"])
+def test_what_an_object_hid_is_continued_from_behind_it(fill: str) -> None:
+    rgb, alpha, depth = beside_an_object()
+    found = filled(rgb, alpha, depth, fill)
+    assert ((found[10:30, 30:36] - 0.5).abs() < 0.02).all()
+    assert torch.equal(found[:, :30], rgb[:, :30])
+
+
+def test_beyond_the_border_the_picture_goes_on() -> None:
+    rgb, alpha, depth = beside_an_object()
+    alpha[:, 50:], rgb[:, 50:] = 0, 0
+    assert (filled(rgb, alpha, depth, "inpaint")[:, 50:] > 0.4).all()
+
+
+def test_nothing_or_everything_known() -> None:
+    rgb = torch.rand(8, 8, 3)
+    for alpha in (torch.ones(8, 8), torch.zeros(8, 8)):
+        assert filled(rgb, alpha, torch.ones(8, 8), "inpaint").shape == rgb.shape
+    assert torch.equal(filled(rgb, torch.ones(8, 8), torch.ones(8, 8), "inpaint"), rgb)
+
+
+def test_solid_surfaces_are_left_as_they_are() -> None:
+    assert missing(torch.tensor([0.0, 0.45, 0.9, 1.0])).tolist() == pytest.approx([1.0, 0.5, 0.0, 0.0])

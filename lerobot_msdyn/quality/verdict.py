@@ -119,12 +119,6 @@ def reasons(scores: Scores, config: GateConfig) -> list[str]:
             f"expected quality {scores.expected_db:.1f} dB is under gate.min_expected_db {config.min_expected_db:g}: "
             f"{CAUSES[worst]}"
         )
-    unseen = max(frame.unseen for frame in scores.frames)
-    if unseen > config.max_unseen:
-        found.append(
-            f"{100 * unseen:.0f} % of a frame was never seen, over gate.max_unseen {config.max_unseen:g}: "
-            "choose smaller changes of view"
-        )
     for value, limit, name, text in (
         (scores.track_px, config.max_track_px, "max_track_px", "px from the tracks to the motion"),
         (scores.flicker_ratio, config.max_flicker_ratio, "max_flicker_ratio", "times the video's own flicker"),

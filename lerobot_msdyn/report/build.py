@@ -70,6 +70,7 @@ def _entries(episodes: Sequence[NewEpisode]) -> tuple[list[ViewEntry], dict[int,
                 if not episode.dropped:
                     places[len(entries)] = index
                 drawn, rejected = origin.perturbation[camera], origin.gate["rejected"]
+                view = view | origin.views[camera]
                 dropped = bool(episode.dropped)
                 entries.append(ViewEntry(episode.source_index, origin.variant, camera, drawn, view, rejected, dropped))
         index += not episode.dropped

@@ -8,6 +8,7 @@ from typing import Any
 from lerobot_msdyn.report.drawing import cameras_from_above
 
 LISTED = 1000  # rows of the table, at most
+DRAWN_POSES = 8  # of a camera that moves along the episode, about
 STYLE = """
 :root{--ink:#1c2330;--soft:#5c6675;--line:#dde2e8;--paper:#fff;--back:#f5f6f8;--new:#c2351f;--good:#1d7a46}
 *{box-sizing:border-box}
@@ -78,7 +79,7 @@ class ViewEntry:
     variant: int
     camera: str
     drawn: dict[str, float]  # the change of view
-    view: dict[str, Any]  # camera_from_source, distance, and scores if it was judged
+    view: dict[str, Any]  # camera_from_source, distance_m, and scores if it was judged
     rejected: list[str]  # reasons of the draws before
     dropped: bool
     pictures: Pictures | None = None
@@ -146,7 +147,7 @@ def _article(entry: ViewEntry) -> str:
 def _pictures(entry: ViewEntry) -> str:
     change = text(", ".join(_with_unit(name, value) for name, value in entry.drawn.items()))
     above = (
-        f"<figure>{cameras_from_above([entry.view['camera_from_source']], entry.view['distance'])}"
+        f"<figure>{cameras_from_above(_poses(entry.view['camera_from_source']), entry.view['distance_m'])}"
         f"<figcaption>From above: recorded camera grey, new one red. {change}</figcaption></figure>"
     )
     pictures = entry.pictures
@@ -165,6 +166,12 @@ def _pictures(entry: ViewEntry) -> str:
         f"background-image:url('{pictures.film}')\"></div>"
         f"<figcaption>Recorded left, new right</figcaption></figure>{heat}{above}</div>"
     )
+
+
+def _poses(matrices: list[Any]) -> list[Any]:
+    """A few of a camera's poses: one, or some along an episode in which it moves."""
+    every = max(1, len(matrices) // DRAWN_POSES)
+    return matrices[::every] if isinstance(matrices[0][0], list) else [matrices]
 
 
 def _with_unit(name: str, value: float) -> str:
