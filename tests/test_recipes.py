@@ -29,7 +29,7 @@ def test_show_is_the_file_and_the_file_opens_with_purpose_command_and_cost(
     assert text == (PROJECT / "recipes" / f"{name}.yaml").read_text()
     head = [line for line in text.splitlines() if line.startswith("#")]
     assert head[1].strip("# ").startswith(f"python -m lerobot_msdyn.augment --repo local/ds --recipe {name}")
-    assert head[2].startswith("# Costs ")
+    assert head[2].startswith("# Costs")
 
 
 @pytest.mark.parametrize("name", NAMES)

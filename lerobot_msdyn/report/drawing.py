@@ -17,7 +17,7 @@ def cameras_from_above(cameras_from_source: Sequence[Sequence[Sequence[float]]],
         distance: from the recorded camera to the look-at point, m.
     """
     new = [np.linalg.inv(np.asarray(matrix, float)) for matrix in cameras_from_source]
-    corners = [np.array([[0, 0], [0, distance]])] + [_triangle(pose, distance) for pose in [np.eye(4), *new]]
+    corners = [np.stack((*_triangle(pose, distance), _target(pose, distance))) for pose in [np.eye(4), *new]]
     points = np.concatenate(corners)
     low, high = points.min(0), points.max(0)
     scale = (SIZE - 2 * MARGIN) / max(float((high - low).max()), 1e-9)
@@ -28,10 +28,9 @@ def cameras_from_above(cameras_from_source: Sequence[Sequence[Sequence[float]]],
         return f"{SIZE / 2 + x:.1f},{SIZE / 2 - y:.1f}"
 
     def camera(pose: np.ndarray, kind: str) -> str:
-        place = pose[[0, 2], 3]
-        ahead = place + pose[[0, 2], 2] * distance
+        sight = f"{at(pose[[0, 2], 3])} {at(_target(pose, distance))}"
         return (
-            f'<polyline class="sight {kind}" points="{at(place)} {at(ahead)}"/>'
+            f'<polyline class="sight {kind}" points="{sight}"/>'
             f'<polygon class="{kind}" points="{" ".join(at(corner) for corner in _triangle(pose, distance))}"/>'
         )
 
@@ -41,6 +40,11 @@ def cameras_from_above(cameras_from_source: Sequence[Sequence[Sequence[float]]],
         f'<svg viewBox="0 0 {SIZE} {SIZE}" role="img" aria-label="camera poses from above">{drawn}'
         f'<circle class="target" cx="{x}" cy="{y}" r="4"/></svg>'
     )
+
+
+def _target(pose: np.ndarray, distance: float) -> np.ndarray:
+    """The point [2] at a distance on a camera's axis, from above."""
+    return np.asarray(pose[[0, 2], 3] + pose[[0, 2], 2] * distance)
 
 
 def _triangle(pose: np.ndarray, distance: float) -> np.ndarray:

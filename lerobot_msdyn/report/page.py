@@ -190,7 +190,7 @@ def _scores(scores: dict[str, Any]) -> str:
     return f'<dl>{items}<div class="wide"><dt>expected error from</dt><dd class="soft">{text(cause)}</dd></div></dl>'
 
 
-def _frames(frames: Sequence[dict[str, float]]) -> str:
+def _frames(frames: Sequence[dict[str, Any]]) -> str:
     rows = "".join(
         f"<tr><td>{frame['frame']:.0f}</td><td>{frame['expected_db']:.1f} dB</td><td>{frame['unseen']:.1%}</td>"
         f"<td>{frame['angle_deg']:.1f}°</td><td>{frame['sharpness_ratio']:.2f}</td></tr>"

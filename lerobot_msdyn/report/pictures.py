@@ -45,7 +45,7 @@ def film(before: Sequence[ndarray], after: Sequence[ndarray]) -> UInt8[ndarray, 
     return np.concatenate(pairs, axis=1)
 
 
-def heat_map(picture: UInt8[ndarray, "h w 3"], percent: Sequence[Sequence[int]]) -> UInt8[ndarray, "h w 3"]:
+def heat_map(picture: UInt8[ndarray, "h w 3"], percent: Sequence[Sequence[int]]) -> UInt8[ndarray, "height width 3"]:
     """A new picture in grey, red where the frames show what nobody has seen."""
     small = _narrowed(picture, STRIP_WIDTH)
     height, width = small.shape[:2]
@@ -61,7 +61,7 @@ def _beside(pictures: Sequence[ndarray]) -> UInt8[ndarray, "h w 3"]:
     return np.concatenate(parts, axis=1)
 
 
-def _narrowed(picture: UInt8[ndarray, "h w 3"], width: int) -> UInt8[ndarray, "h w 3"]:
+def _narrowed(picture: UInt8[ndarray, "h w 3"], width: int) -> UInt8[ndarray, "height width 3"]:
     height = max(1, round(width * picture.shape[0] / picture.shape[1]))
     way = cv2.INTER_AREA if width < picture.shape[1] else cv2.INTER_LINEAR
     return cv2.resize(picture, (width, height), interpolation=way)
