@@ -5,7 +5,6 @@ import logging
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Float, UInt8
 from lerobot.datasets import LeRobotDatasetMetadata
 from numpy import ndarray
@@ -19,6 +18,7 @@ from lerobot_msdyn.priors.camera_motion import SWAY_PX, camera_motion_px
 logger = logging.getLogger(__name__)
 
 CORRELATED = 0.4  # of the picture's motion with the robot's
+EVEN = 0.1  # relative spread of the picture's speed up to which it moves evenly: nothing to correlate
 MIN_PAIRS = 8
 SMALL_PX = 160  # width at which pictures are compared
 
@@ -71,16 +71,12 @@ def correlation(state: Float[Tensor, "t s"], rgb: UInt8[Tensor, "t h w 3"]) -> f
     small = [_small(rgb[int(frame)]) for frame in frames]
     window = cv2.createHanningWindow(small[0].shape[::-1], cv2.CV_32F)
     shift = np.array([np.hypot(*cv2.phaseCorrelate(a, b, window)[0]) for a, b in itertools.pairwise(small)])
-    if speed.std() < 1e-6 or shift.std() < 1e-6:
+    if speed.std() < 1e-6 or shift.std() <= EVEN * shift.mean():
         return 0.0
-    return float(np.corrcoef(_ranks(speed), _ranks(shift))[0, 1])
+    return float(np.corrcoef(speed, shift)[0, 1])
 
 
 def _small(image: UInt8[Tensor, "h w 3"]) -> ndarray:
     grey = cv2.cvtColor(image.numpy(), cv2.COLOR_RGB2GRAY).astype(np.float32)
     height = max(1, round(grey.shape[0] * SMALL_PX / grey.shape[1]))
     return cv2.resize(grey, (SMALL_PX, height), interpolation=cv2.INTER_AREA)
-
-
-def _ranks(values: ndarray) -> ndarray:
-    return torch.from_numpy(values).argsort().argsort().numpy().astype(float)

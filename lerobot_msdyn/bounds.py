@@ -61,7 +61,7 @@ def new_cameras(
         return max(_unseen(scenes[key], camera) for key, camera in at(factor).items())
 
     if isinstance(recipe.perturbation, PosesConfig) and any(
-        is_behind_scene(scenes[key], c) for key, c in at(1).items()
+        is_behind_scene(scenes[key], c) for key, c in at(1.0).items()
     ):
         raise ConfigError(
             f"the pose of perturbation.poses for variant {variant} is behind what the recorded camera of "

@@ -55,10 +55,11 @@ def _hiding(holes: Bool[ndarray, "h w"], depth: Float[ndarray, "h w"]) -> Bool[n
     inner = _inside(holes)
     if not inner.any():
         return np.zeros_like(holes)
-    half = float(cv2.distanceTransform(inner.astype(np.uint8), cv2.DIST_L2, 3).max())
-    window = np.ones((2 * min(round(2 * half) + MARGIN_PX, MAX_REACH_PX) + 1,) * 2, np.uint8)
-    farthest = cv2.dilate(np.where(holes, np.float32(0), depth.astype(np.float32)), window)
-    beside = cv2.dilate(inner.astype(np.uint8), window) > 0
+    width = round(2 * float(cv2.distanceTransform(inner.astype(np.uint8), cv2.DIST_L2, 3).max()))
+    reach = min(width + MARGIN_PX, MAX_REACH_PX)
+    around, across = (np.ones((2 * size + 1,) * 2, np.uint8) for size in (reach, 2 * reach))
+    farthest = cv2.dilate(np.where(holes, np.float32(0), depth.astype(np.float32)), across)
+    beside = cv2.dilate(inner.astype(np.uint8), around) > 0
     return beside & ~holes & (depth < (1 - NEARER) * farthest)
 
 

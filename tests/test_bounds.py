@@ -69,7 +69,7 @@ def test_covered_rectangle() -> None:
 
 
 def test_a_pose_behind_the_table_is_refused(scenes: dict[str, Reconstruction]) -> None:
-    ahead = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, -3.0]  # 3 m along the optical axis
+    ahead = [*torch.eye(4)[:2].flatten().tolist(), 0.0, 0.0, 1.0, -3.0]  # 3 m along the optical axis
     with pytest.raises(ConfigError, match="behind what the recorded camera of episode 0 sees") as caught:
         new_cameras(scenes, recipe(perturbation=PosesConfig(poses=[ahead])), 0, 0)
     assert "\n" not in str(caught.value)
