@@ -91,11 +91,11 @@ def _pictures(source: LeRobotDatasetMetadata, output: LeRobotDatasetMetadata, in
         for meta, number in ((source, entry.episode), (output, index))
     )
     few, many = (spread(len(before), count) for count in (STRIP_FRAMES, CLIP_FRAMES))
-    moving = film(before[many], after[many])
+    moving = film(list(before[many]), list(after[many]))
     scores = entry.view.get("scores")
     heat = None if scores is None else data_url(heat_map(after[len(after) // 2], scores["heat"]))
     return Pictures(
-        data_url(strip(before[few], after[few])),
+        data_url(strip(list(before[few]), list(after[few]))),
         data_url(moving),
         len(many),
         moving.shape[1] / len(many) / moving.shape[0],
