@@ -39,7 +39,7 @@ class Reconstruction:
     def windows(self) -> list[Witnessed]:
         """What a new view is judged by."""
         parts = zip(self.results, self.evidence, self.witnesses, self.starts, strict=True)
-        return [Witnessed(result.scene, *rest) for result, *rest in parts]
+        return [Witnessed(result.scene, seen, witness, start) for result, seen, witness, start in parts]
 
     @property
     def seconds(self) -> float:
