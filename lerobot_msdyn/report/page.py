@@ -30,7 +30,8 @@ img,svg{display:block;width:100%;height:auto;border-radius:4px}
 animation:film calc(var(--frames) * .16s) steps(var(--frames),jump-none) infinite}
 @keyframes film{from{background-position:0 0}to{background-position:100% 0}}
 @media (prefers-reduced-motion:reduce){.film{animation:none}}
-svg{background:var(--back)}
+svg{background:var(--back);max-width:320px}
+.why{margin:12px 0 0}
 svg .recorded{fill:#8b95a3;stroke:#8b95a3}svg .new{fill:var(--new);stroke:var(--new)}
 svg polygon.recorded{fill:none;stroke-width:2}
 svg .sight{stroke-width:1;stroke-dasharray:3 4;opacity:.6}svg .target{fill:none;stroke:var(--ink);stroke-width:1.5}
