@@ -37,6 +37,7 @@ class FitResult:
     train_psnr_db: float  # over a few frames of the recorded camera
     steps: int  # how many were taken
     seconds: float
+    held_out: Int[Tensor, " b"]  # frames that were not fitted
 
 
 @dataclass(frozen=True)
@@ -113,7 +114,7 @@ def fit(
             break
     if len(history) < config.steps:
         progress(config.steps - len(history))
-    return _result(_detached(scene), history, view, backend, time.perf_counter() - start)
+    return _result(_detached(scene), history, view, held_out, backend, time.perf_counter() - start)
 
 
 @torch.no_grad()
@@ -172,12 +173,17 @@ def _with_moving_gain(scene: DynamicScene, view: View, priors: Priors, backend: 
 
 
 def _result(
-    scene: DynamicScene, history: list[dict[str, Tensor]], view: View, backend: str, seconds: float
+    scene: DynamicScene,
+    history: list[dict[str, Tensor]],
+    view: View,
+    held_out: Int[Tensor, " b"],
+    backend: str,
+    seconds: float,
 ) -> FitResult:
     last = history[-max(1, len(history) // 10) :]
     losses = {name: float(torch.stack([step[name] for step in last]).mean()) for name in (last[0] if last else {})}
     frames = torch.linspace(0, len(view.rgb) - 1, min(SCORED_FRAMES, len(view.rgb))).round().long()
-    result = FitResult(scene, losses, psnr(scene, view, frames, backend), len(history), seconds)
+    result = FitResult(scene, losses, psnr(scene, view, frames, backend), len(history), seconds, held_out)
     logger.info(
         "fit: %d + %d Gaussians, %d steps in %.0f s, %.1f dB on the recorded camera",
         len(scene.static),

@@ -2,8 +2,10 @@
 
 import functools
 import logging
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from lerobot.datasets import LeRobotDatasetMetadata
@@ -21,6 +23,8 @@ from lerobot_msdyn.initialisation import initialise
 from lerobot_msdyn.perturbation import look_at_distance
 from lerobot_msdyn.priors import Priors, estimate_priors
 from lerobot_msdyn.provenance import SOURCE_VARIANT, Provenance, camera_pose, merged
+from lerobot_msdyn.quality.verdict import judge, reasons, record
+from lerobot_msdyn.quality.witness import Witness, witness
 from lerobot_msdyn.render.threads import torch_on_one_thread
 from lerobot_msdyn.shared import (
     SharedBackground,
@@ -38,7 +42,6 @@ logger = logging.getLogger(__name__)
 SHARP_DEPTH = ("recorded", "plane")  # providers whose depth has sharp edges and agrees between frames
 ROUGH_BORDER_PX = 2  # with the others' depth: from the border of a mask ...
 ROUGH_FRAMES = 6  # ... and so few frames are gathered, whose depths disagree
-ATTEMPTS = 3  # draws of one new episode before it is given up
 FURTHER_STEPS = 0.6  # share of the fit's steps that suffices where the static set has been fitted already
 
 Progress = Callable[[str, float], object]  # (what is being done, share of the episode done since the last call)
@@ -79,23 +82,38 @@ def augment_episode(
         new.append(NewEpisode(index, Provenance(source.repo_id, index, SOURCE_VARIANT, recipe.seed, {}, priors)))
     for variant in range(recipe.variants):
         progress(f"episode {index}: rendering variant {variant}", 0.0)
-        found = _accepted(scenes, recipe, index, variant, other)
-        if found is not None:
-            new.append(_staged(source, index, variant, recipe, output, scenes, found))
+        found, gate = _accepted(scenes, recipe, index, variant, other)
+        new.append(_staged(source, index, variant, recipe, output, scenes, found, gate))
         progress("", 0.5 / recipe.variants)
     return new
 
 
 def _accepted(
     scenes: Mapping[str, Reconstruction], recipe: Recipe, index: int, variant: int, other: Tensor | None
-) -> NewCameras | None:
-    """The cameras of one new episode, drawn again where they show too much that was never seen; None: given up."""
-    for attempt in range(ATTEMPTS):
+) -> tuple[NewCameras, dict[str, Any]]:
+    """The cameras of one new episode, drawn again where they are rejected, and the gate's record."""
+    start = time.perf_counter()
+    rejected: list[str] = []
+    for attempt in range(recipe.gate.redraws + 1):
         found = new_cameras(scenes, recipe, index, variant, attempt, other)
-        if not found.rejected:
-            return found
-        logger.warning("episode %d variant %d, draw %d: rejected: %s", index, variant, attempt, found.rejected)
-    return None
+        views: dict[str, dict[str, Any]] = {key: {"distance_m": scene.distance} for key, scene in scenes.items()}
+        why = [found.rejected] if found.rejected else []
+        for key, scene in scenes.items():
+            if recipe.gate.enabled:
+                scores = judge(scene.windows, found.cameras[key])
+                views[key]["scores"] = record(scores)
+                why += [f"{key}: {reason}" for reason in reasons(scores, recipe.gate)]
+        if not why:
+            break
+        rejected.append("; ".join(why))
+        logger.warning("episode %d variant %d, draw %d: rejected: %s", index, variant, attempt, rejected[-1])
+    return found, {
+        "views": views,
+        "rejected": rejected,
+        "dropped": rejected[-1] if len(rejected) > recipe.gate.redraws else "",
+        "fit_seconds": {key: round(scene.seconds, 1) for key, scene in scenes.items()},
+        "gate_seconds": round(time.perf_counter() - start, 1),
+    }
 
 
 def _staged(
@@ -106,12 +124,9 @@ def _staged(
     output: OutputDataset,
     scenes: Mapping[str, Reconstruction],
     found: NewCameras,
+    gate: dict[str, Any],
 ) -> NewEpisode:
-    """One new episode, rendered and encoded."""
-    pictures = {key: new_pictures(scene, found.cameras[key], fill=recipe.fill) for key, scene in scenes.items()}
-    masks = UnseenMasks() if recipe.masks else None
-    if masks is not None:
-        pictures = {key: masks.kept(key, some) for key, some in pictures.items()}
+    """One new episode, rendered and encoded; nothing is rendered of one that was dropped."""
     provenance = Provenance(
         source.repo_id,
         index,
@@ -120,7 +135,14 @@ def _staged(
         found.drawn,
         {key: scene.provenance for key, scene in scenes.items()},
         {key: camera_pose(scene.camera, found.cameras[key]) for key, scene in scenes.items()},
+        gate,
     )
+    if gate["dropped"]:
+        return NewEpisode(index, provenance, dropped=gate["dropped"])
+    pictures = {key: new_pictures(scene, found.cameras[key], fill=recipe.fill) for key, scene in scenes.items()}
+    masks = UnseenMasks() if recipe.masks else None
+    if masks is not None:
+        pictures = {key: masks.kept(key, some) for key, some in pictures.items()}
     new = output.stage(index, variant, by_feature(source, pictures), provenance)
     return new if masks is None else replace(new, masks=masks.arrays())
 
@@ -183,12 +205,12 @@ def reconstruct(
             device=recipe.device,
         )
         fitted.append(_fit_window(shrink(window, recipe.fit.max_width), recipe, within, backgrounds, priors_of))
-    results, known, distances, evidence = zip(*fitted, strict=True)
+    results, known, distances, evidence, witnesses = zip(*fitted, strict=True)
     starts = tuple(start for start, _ in parts)
     camera = concatenated([part.camera for part in evidence]).resized(view.camera.width, view.camera.height)
     metric = all(priors.metric for priors in known)
     said = merged([priors.provenance for priors in known])
-    return Reconstruction(results, starts, metric, said, camera, distances[0], evidence)
+    return Reconstruction(results, starts, metric, said, camera, distances[0], evidence, witnesses)
 
 
 def _fit_window(
@@ -197,8 +219,8 @@ def _fit_window(
     progress: Callable[[float], object],
     backgrounds: Sequence[SharedBackground],
     priors_of: Callable[..., Priors],
-) -> tuple[FitResult, Priors, float, Evidence]:
-    """A fitted scene of one window, its priors, look-at distance (m) and what was recorded, at the size of the fit."""
+) -> tuple[FitResult, Priors, float, Evidence, Witness]:
+    """A fitted scene of one window, its priors, look-at distance (m), what was recorded, and how well that is met."""
     steps, settings = recipe.fit.steps, recipe.scene
     with torch_on_one_thread():
         shared = next((background for background in backgrounds if background.fits(view)), None)
@@ -228,9 +250,11 @@ def _fit_window(
             seed=recipe.seed,
             progress=lambda done: progress(done / steps),
         )
+        seen = evidence_of(result.scene, view.camera, empty)
+        said = witness(result.scene, view, priors, result.held_out)  # of frames that an overlay would show as recorded
         if settings.overlay:
             result = replace(result, scene=replace(result.scene, overlay=unexplained(result.scene, view, priors)))
-    return result, priors, distance, evidence_of(result.scene, view.camera, empty)
+    return result, priors, distance, seen, said
 
 
 def _for_rough_depth(scene: SceneConfig) -> SceneConfig:

@@ -23,6 +23,7 @@ ONLY_IN = {
         "pipeline",
         "estimate",
         "engines",
+        "report",
         "augment",
         "evaluate",
         "training",
