@@ -38,7 +38,7 @@ def scene(pushed: View) -> Reconstruction:
 
 
 def turned(camera: CameraTrack, degrees: float, distance: float) -> CameraTrack:
-    offset = orbit_offset(degrees, 0.0, distance)
+    offset = orbit_offset(float(degrees), 0.0, distance)
     return dataclasses.replace(camera, world_from_camera=camera.world_from_camera @ offset)
 
 
