@@ -1,5 +1,6 @@
 """Who runs which episode: for now this process, one after the other."""
 
+import functools
 import logging
 
 from lerobot.datasets import LeRobotDatasetMetadata
@@ -38,10 +39,11 @@ def run_local(
             bar.update(min(share, len(episodes) - bar.n))  # shares add up to one only up to rounding
 
         bar.set_description_str("looking at the background")
-        backgrounds = shared_backgrounds(source, cameras, config)
+        backgrounds = output.staging.keep("backgrounds", lambda: shared_backgrounds(source, cameras, config))
         for done, index in enumerate(episodes, start=1):
             try:
-                new += augment_episode(source, index, cameras, config, output, progress, backgrounds)
+                make = functools.partial(augment_episode, source, index, cameras, config, output, progress, backgrounds)
+                new += output.finish_episode(index, make)
             except EpisodeError as error:
                 logger.error("skipped: %s", error)
                 failures.append(error)

@@ -1,32 +1,33 @@
 """Read LeRobot episodes into plain tensors: pixels, cameras, recorded depth, state and action."""
 
-import json
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import av
 import cv2
-import httpx
 import numpy as np
+import PIL.Image
 import pyarrow as pa
-import pyarrow.parquet as pq
 import torch
 from jaxtyping import Float, UInt8
 from lerobot.configs import DepthEncoderConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.datasets.depth_utils import dequantize_depth
-from lerobot.datasets.utils import CompatibilityError
 from lerobot.datasets.video_utils import decode_video_frames
 from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, OBS_STATE
 from torch import Tensor
 
 from lerobot_msdyn.cameras import CameraTrack, intrinsics_from_fov, read_calibration, static_camera
+from lerobot_msdyn.checks import check_metadata, picture_size, read_json
 from lerobot_msdyn.config import CameraConfig
 from lerobot_msdyn.errors import DatasetError, EpisodeError
+from lerobot_msdyn.rows import TIMESTAMP_TOLERANCE_S, first_line, read_rows, source_file, task_of
 
 VIDEO_BACKEND = "pyav"
-TIMESTAMP_TOLERANCE_S = 1e-4
 CODEBASE_VERSION = "v3.0"
+BLOCK_FRAMES = 256  # that are decoded at once
 MILLIMETRES = 1000.0
 
 
@@ -54,7 +55,7 @@ class Episode:
     """One recorded episode; the views are those that were asked for."""
 
     source: EpisodeSource
-    fps: int
+    fps: int | float
     time: Float[Tensor, " t"]  # s since the episode's start
     views: dict[str, View]
     state: Float[Tensor, "t s"] | None
@@ -69,48 +70,50 @@ def open_source(repo_id: str, root: Path | None = None) -> LeRobotDatasetMetadat
     """The metadata of a dataset in `root`, else in LeRobot's home, else on the hub. Nothing is written to `root`.
 
     Raises:
-        DatasetError: there is no such dataset, or it is not of version v3.0.
+        DatasetError: there is no such dataset, it is not of version v3.0, or its metadata is not what it should be.
     """
     folder = HF_LEROBOT_HOME / repo_id if root is None else root
-    info_path = folder / "meta" / "info.json"
-    if root is not None and not info_path.is_file():
-        raise DatasetError(
-            f"no dataset in {root}: {info_path} is absent; "
-            "--root is the exact folder that holds meta/, data/ and videos/"
-        )
-    if info_path.is_file():
-        _check_version(info_path)
-    try:
-        return LeRobotDatasetMetadata(repo_id, root)
-    except (OSError, ValueError, KeyError, TypeError, CompatibilityError, httpx.HTTPError) as error:
-        if info_path.is_file():
+    if not (folder / "meta" / "info.json").exists():
+        if root is not None:
             raise DatasetError(
-                f"{folder}: the dataset's meta/ cannot be read ({type(error).__name__}: {error})"
-            ) from error
+                f"no dataset in {root}: {root / 'meta' / 'info.json'} is absent; "
+                "--root is the exact folder that holds meta/, data/ and videos/"
+            )
+        folder = _from_hub(repo_id, folder)
+    check_version(folder)
+    check_metadata(folder)
+    try:
+        return LeRobotDatasetMetadata(repo_id, folder)
+    except Exception as error:  # several libraries read the metadata, each with errors of its own
+        raise DatasetError(f"{folder}: the dataset's meta/ cannot be read ({first_line(error)})") from error
+
+
+def _from_hub(repo_id: str, folder: Path) -> Path:
+    """Where LeRobot put a dataset that it downloaded."""
+    try:
+        return LeRobotDatasetMetadata(repo_id).root
+    except Exception as error:
         raise DatasetError(
             f"no dataset {repo_id!r}: not in {folder}, and the hub does not have it or cannot be reached "
             f"({type(error).__name__}); give its folder with --root"
         ) from error
 
 
-def _check_version(info_path: Path) -> None:
-    try:
-        version = json.loads(info_path.read_text()).get("codebase_version")
-    except (OSError, ValueError, AttributeError) as error:
-        raise DatasetError(f"{info_path} is not readable JSON ({error})") from error
+def check_version(root: Path) -> None:
+    """Whether a dataset is of the version that this LeRobot reads.
+
+    Raises:
+        DatasetError: it is not; the way to convert it is named.
+    """
+    version = read_json(root, "meta/info.json").get("codebase_version")
     if version == "v2.1":
-        todo = (
-            "convert a copy of it with "
-            "`python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=NAME --root=FOLDER --push-to-hub=false`"
-        )
+        todo = "add --convert to work on a converted copy of it (the source stays as it is)"
     elif str(version).startswith(("v1", "v2")):
-        todo = "convert it to v2.1 with an older LeRobot first, then with lerobot.scripts.convert_dataset_v21_to_v30"
+        todo = "convert it to v2.1 with an older LeRobot first, then add --convert"
     else:
         todo = "use a LeRobot and an lerobot_msdyn that know this version"
     if version != CODEBASE_VERSION:
-        raise DatasetError(
-            f"{info_path.parent.parent} is a LeRobot dataset of version {version}; expected {CODEBASE_VERSION}; {todo}"
-        )
+        raise DatasetError(f"{root} is a LeRobot dataset of version {version}; expected {CODEBASE_VERSION}; {todo}")
 
 
 def select_episodes(meta: LeRobotDatasetMetadata, episodes: list[int] | None) -> list[int]:
@@ -164,37 +167,6 @@ def is_wrist_camera(key: str) -> bool:
     return any(word in name for word in ("wrist", "hand", "gripper", "palm"))
 
 
-def read_rows(meta: LeRobotDatasetMetadata, index: int) -> pa.Table:
-    """The parquet rows of one episode, in order and bit for bit.
-
-    Raises:
-        EpisodeError: the data file is absent, damaged, or has another number of rows than the metadata says.
-    """
-    path = inside_root(meta, meta.get_data_file_path(index))
-    try:
-        rows = pq.read_table(path, filters=[("episode_index", "=", index)])
-    except (OSError, pa.ArrowException) as error:
-        raise EpisodeError(f"{meta.repo_id} episode {index}: {path} cannot be read ({_first_line(error)})") from error
-    expected = int(meta.episodes[index]["length"])
-    if rows.num_rows != expected or expected == 0:
-        raise EpisodeError(f"{meta.repo_id} episode {index}: {path} has {rows.num_rows} rows; expected {expected}")
-    return rows.sort_by("frame_index")
-
-
-def inside_root(meta: LeRobotDatasetMetadata, relative: Path) -> Path:
-    """The file of a dataset at a path that its metadata gives; such a path may not leave the dataset's folder.
-
-    Raises:
-        DatasetError: it does.
-    """
-    path = (meta.root / relative).resolve()
-    if not path.is_relative_to(meta.root.resolve()):
-        raise DatasetError(
-            f"{meta.repo_id}: its metadata names {relative}, which is outside of {meta.root}; refusing to read it"
-        )
-    return path
-
-
 def read_episode(
     meta: LeRobotDatasetMetadata, index: int, cameras: list[str], config: CameraConfig, *, recorded_depth: bool = True
 ) -> Episode:
@@ -220,7 +192,6 @@ def read_episode(
                     "only depth that is aligned to the colour image can be used (--priors.depth plane goes without)"
                 )
         views[key] = View(rgb, make_camera(key, index, rgb, config), depth, depth_range)
-    task = str(meta.tasks.iloc[int(rows["task_index"][0].as_py())].name)
     return Episode(
         source=EpisodeSource(meta.repo_id, meta.root, index),
         fps=meta.fps,
@@ -228,7 +199,7 @@ def read_episode(
         views=views,
         state=_matrix(rows, OBS_STATE),
         action=_matrix(rows, ACTION),
-        task=task,
+        task=task_of(meta, rows),
     )
 
 
@@ -268,8 +239,7 @@ def read_colour(meta: LeRobotDatasetMetadata, index: int, key: str, rows: pa.Tab
         EpisodeError: a frame is absent or cannot be decoded.
     """
     if key in meta.video_keys:
-        frames = _decode_video(meta, index, key, rows, is_depth=False)
-        return frames.permute(0, 2, 3, 1).contiguous()
+        return _decode_video(meta, index, key, rows, is_depth=False)
     images = [_decode_image(meta, index, key, item, cv2.IMREAD_COLOR_RGB) for item in rows[key].to_pylist()]
     return torch.from_numpy(np.stack(images))
 
@@ -285,7 +255,7 @@ def read_depth(
     if key in meta.video_keys:
         encoder = DepthEncoderConfig.from_video_info(meta.features[key].get("info") or {})
         depth = dequantize_depth(
-            _decode_video(meta, index, key, rows, is_depth=True),
+            _decode_video(meta, index, key, rows, is_depth=True).movedim(-1, 1),
             depth_min=encoder.depth_min,
             depth_max=encoder.depth_max,
             shift=encoder.shift,
@@ -299,31 +269,73 @@ def read_depth(
 
 
 def _decode_video(meta: LeRobotDatasetMetadata, index: int, key: str, rows: pa.Table, *, is_depth: bool) -> Tensor:
-    path = inside_root(meta, meta.get_video_file_path(index, key))
+    """All frames of a video [t,h,w,c], decoded in blocks, so that they are in memory once."""
+    path = source_file(meta, index, meta.get_video_file_path(index, key))
     start = float(meta.episodes[index][f"videos/{key}/from_timestamp"])
     timestamps = [start + float(t) for t in rows["timestamp"].to_pylist()]
     where = f"{meta.repo_id} episode {index}, {key}"
-    if not path.is_file():
-        raise EpisodeError(f"{where}: {path} is absent")
+    height, width, _ = picture_size(meta.features[key])
+    frames: Tensor | None = None
     try:
-        return decode_video_frames(
-            path, timestamps, TIMESTAMP_TOLERANCE_S, VIDEO_BACKEND, return_uint8=True, is_depth=is_depth
-        )
+        _check_stream(path, width, height)
+        for first in range(0, len(timestamps), BLOCK_FRAMES):
+            block = decode_video_frames(
+                path,
+                timestamps[first : first + BLOCK_FRAMES],
+                TIMESTAMP_TOLERANCE_S,
+                VIDEO_BACKEND,
+                return_uint8=True,
+                is_depth=is_depth,
+            ).movedim(1, -1)
+            if frames is None:
+                frames = block.new_empty(len(timestamps), *block.shape[1:])
+            frames[first : first + len(block)] = block
+    except DatasetError as error:
+        raise EpisodeError(f"{where}: {error}") from error
     except (OSError, ValueError, RuntimeError, IndexError) as error:  # PyAV's errors are OSErrors and ValueErrors
         raise EpisodeError(
-            f"{where}: {path} cannot be decoded for all of its {len(timestamps)} frames ({_first_line(error)})"
+            f"{where}: {path} cannot be decoded for all of its {len(timestamps)} frames ({first_line(error)})"
         ) from error
+    assert frames is not None
+    return frames
 
 
-def _decode_image(meta: LeRobotDatasetMetadata, index: int, key: str, item: dict[str, Any], flags: int) -> np.ndarray:
+def _check_stream(path: Path, width: int, height: int) -> None:
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0].codec_context
+        if (stream.width, stream.height) != (width, height):
+            raise DatasetError(
+                f"{path} is {stream.width}x{stream.height}; meta/info.json says {width}x{height}: correct its shape"
+            )
+
+
+def _decode_image(meta: LeRobotDatasetMetadata, index: int, key: str, item: Any, flags: int) -> np.ndarray:
     """One image of an image feature: the bytes in the parquet row, else the file that it names inside the dataset."""
-    content = item["bytes"]
+    where = f"{meta.repo_id} episode {index}, {key}"
+    content, name = (item or {}).get("bytes"), (item or {}).get("path")
     if content is None:
-        content = inside_root(meta, Path(item["path"])).read_bytes()
+        if not name:
+            raise EpisodeError(f"{where}: a frame has no image")
+        content = source_file(meta, index, Path(name)).read_bytes()
+    height, width, _ = picture_size(meta.features[key])
+    try:
+        with PIL.Image.open(io.BytesIO(content)) as header:
+            size = header.size
+    except (OSError, ValueError, SyntaxError, PIL.Image.DecompressionBombError) as error:
+        raise EpisodeError(f"{where}: an image of {len(content)} bytes cannot be decoded") from error
+    if size != (width, height):
+        raise EpisodeError(
+            f"{where}: an image is {size[0]}x{size[1]}; meta/info.json says {width}x{height}: correct its shape"
+        )
     image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     if image is None:
-        raise EpisodeError(f"{meta.repo_id} episode {index}, {key}: an image of {len(content)} bytes cannot be decoded")
+        raise EpisodeError(f"{where}: an image of {len(content)} bytes cannot be decoded")
     return image
+
+
+def picture_channels(meta: LeRobotDatasetMetadata, key: str) -> int:
+    """How many channels a picture feature has: 1, 3 or 4."""
+    return picture_size(meta.features[key])[2]
 
 
 def encode_image(image: np.ndarray, suffix: str) -> bytes:
@@ -344,8 +356,3 @@ def _matrix(rows: pa.Table, key: str) -> Float[Tensor, "t n"] | None:
         return None
     values = np.stack([np.atleast_1d(np.asarray(item, np.float32)) for item in rows[key].to_pylist()])
     return torch.from_numpy(values)
-
-
-def _first_line(error: BaseException) -> str:
-    text = str(error).strip()
-    return f"{type(error).__name__}: {text.splitlines()[0]}" if text else type(error).__name__

@@ -33,6 +33,7 @@ from lerobot_msdyn.shared import (
     few_frames,
     share_backgrounds,
 )
+from lerobot_msdyn.staging import SCENE
 from lerobot_msdyn.write import NewEpisode, OutputDataset
 
 logger = logging.getLogger(__name__)
@@ -76,11 +77,8 @@ def shared_backgrounds(source: LeRobotDatasetMetadata, cameras: list[str], recip
 
     Episodes that cannot be read are left out here, and reported when it is their turn.
     """
-    if not recipe.scene.shared_background or source.total_episodes < 2:
-        return {}
     views: dict[str, list[View]] = {key: [] for key in cameras}
-    count = min(MAX_EPISODES, source.total_episodes)
-    for index in sorted({round(i * (source.total_episodes - 1) / (count - 1)) for i in range(count)}):
+    for index in background_episodes(source, recipe):
         with contextlib.suppress(EpisodeError):
             episode = read_episode(source, index, cameras, recipe.camera, recorded_depth=recipe.priors.depth != "plane")
             for key, view in episode.views.items():
@@ -88,6 +86,14 @@ def shared_backgrounds(source: LeRobotDatasetMetadata, cameras: list[str], recip
     with _one_torch_thread():
         found = {key: share_backgrounds(some) for key, some in views.items()}
     return {key: [_fitted(background, recipe) for background in some] for key, some in found.items()}
+
+
+def background_episodes(source: LeRobotDatasetMetadata, recipe: Recipe) -> list[int]:
+    """The episodes that `shared_backgrounds` looks at."""
+    if not recipe.scene.shared_background or source.total_episodes < 2:
+        return []
+    count = min(MAX_EPISODES, source.total_episodes)
+    return sorted({round(i * (source.total_episodes - 1) / (count - 1)) for i in range(count)})
 
 
 def _fitted(background: SharedBackground, recipe: Recipe) -> SharedBackground:
@@ -124,15 +130,19 @@ def augment_episode(
 ) -> list[NewEpisode]:
     """All new episodes of one source episode, staged in the output; `backgrounds` come from `shared_backgrounds`.
 
+    What an earlier run has finished of it is taken from the output's work folder.
+
     Raises:
         EpisodeError: the episode cannot be read.
         PriorError: a prior was demanded and cannot be had.
     """
     episode = read_episode(source, index, cameras, recipe.camera, recorded_depth=recipe.priors.depth != "plane")
+    kept = output.episode(index)
     scenes = {}
     for key, view in episode.views.items():
         progress(f"episode {index}: fitting {key}", 0.0)
-        scenes[key] = reconstruct(
+        make_scene = functools.partial(
+            reconstruct,
             view,
             recipe,
             lambda share: progress("", 0.5 * share / len(cameras)),
@@ -141,21 +151,36 @@ def augment_episode(
             episode=index,
             key=key,
         )
+        scenes[key] = kept.keep(f"{SCENE}_{key}", make_scene)
     priors = {key: scene.provenance for key, scene in scenes.items()}
     new = []
     if recipe.include_source:
         new.append(NewEpisode(index, Provenance(source.repo_id, index, SOURCE_VARIANT, recipe.seed, {}, priors)))
     for variant in range(recipe.variants):
         progress(f"episode {index}: rendering variant {variant}", 0.0)
-        rng = draw_rng(recipe.seed, index, variant)
-        pictures, drawn = {}, {}
-        for key, scene in scenes.items():
-            offset, drawn[key] = draw_offset(recipe.perturbation, scene.distance, rng)
-            pictures[key] = new_pictures(scene, perturb(scene.camera, offset))
-        provenance = Provenance(source.repo_id, index, variant, recipe.seed, drawn, priors)
-        new.append(output.stage(index, variant, by_feature(source, pictures), provenance))
+        make_episode = functools.partial(_rendered, source, index, variant, scenes, recipe, output)
+        new.append(kept.keep(f"variant_{variant:02d}", make_episode))
         progress("", 0.5 / recipe.variants)
     return new
+
+
+def _rendered(
+    source: LeRobotDatasetMetadata,
+    index: int,
+    variant: int,
+    scenes: Mapping[str, Reconstruction],
+    recipe: Recipe,
+    output: OutputDataset,
+) -> NewEpisode:
+    """One new episode, staged in the output."""
+    rng = draw_rng(recipe.seed, index, variant)
+    pictures, drawn = {}, {}
+    for key, scene in scenes.items():
+        offset, drawn[key] = draw_offset(recipe.perturbation, scene.distance, rng)
+        pictures[key] = new_pictures(scene, perturb(scene.camera, offset))
+    priors = {key: scene.provenance for key, scene in scenes.items()}
+    provenance = Provenance(source.repo_id, index, variant, recipe.seed, drawn, priors)
+    return output.stage(index, variant, by_feature(source, pictures), provenance)
 
 
 def reconstruct(

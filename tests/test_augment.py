@@ -114,7 +114,7 @@ def test_bad_input_is_one_line_and_exit_code_2(desk: Path, tmp_path: Path, capsy
         ([], "which dataset?"),
         (["--repo", "local/absent", "--root", str(tmp_path / "absent")], "no dataset in"),
         (["--repo", "local/absent"], "no dataset 'local/absent'"),
-        (["--repo", "local/desk", "--root", str(old)], "convert_dataset_v21_to_v30"),
+        (["--repo", "local/desk", "--root", str(old)], "add --convert"),
         ([*source, "--cameras", "[top]"], "no colour camera 'top'; it has"),
         ([*source, "--episodes", "[7]"], "no episode 7; it has 3 (0 to 2)"),
         ([*source, "--new_root", str(tmp_path / "there")], "exists already"),
