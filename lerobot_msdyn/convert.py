@@ -6,7 +6,7 @@ from pathlib import Path
 
 from lerobot.scripts.convert_dataset_v21_to_v30 import convert_dataset
 
-from lerobot_msdyn.checks import check_features, inside, read_json
+from lerobot_msdyn.checks import check_features, read_json, regular_file
 from lerobot_msdyn.errors import DatasetError
 from lerobot_msdyn.files import temporary_files_in, writing
 from lerobot_msdyn.rows import first_line
@@ -39,7 +39,7 @@ def converted_copy(repo_id: str, root: Path, folder: Path) -> Path:
             if not path.is_dir():
                 target = copy / path.relative_to(root)
                 target.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(inside(root, path.relative_to(root)), target)
+                shutil.copyfile(regular_file(root, path.relative_to(root)), target)
     level = logging.getLogger().level
     logging.getLogger().setLevel(logging.WARNING)
     try:

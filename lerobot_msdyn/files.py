@@ -64,9 +64,11 @@ def temporary_files_in(folder: Path) -> Iterator[None]:
 
 
 def digest_of_file(path: Path) -> str:
-    """A digest of a file's content; "absent" where it cannot be read."""
+    """A digest of a file's content; "absent" where there is none, or it cannot be read."""
     total = hashlib.blake2b(digest_size=DIGEST_BYTES)
     try:
+        if not path.is_file():  # a pipe would be waited for
+            return "absent"
         with path.open("rb") as file:
             while block := file.read(BLOCK_BYTES):
                 total.update(block)
