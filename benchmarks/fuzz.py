@@ -14,6 +14,7 @@ import collections
 import contextlib
 import io
 import json
+import logging
 import os
 import random
 import shutil
@@ -145,7 +146,7 @@ def mutate_bytes(path: Path, rng: random.Random) -> str:
     elif kind == "text":
         content = bytearray(b'{"what": "this is not"}')
     else:
-        content += content
+        content = content + content
     path.write_bytes(bytes(content))
     return f"bytes {kind}"
 
@@ -206,6 +207,7 @@ def trial(original: Path, place: Path, rng: random.Random, *, whole: bool) -> tu
     before, here = listing(source), set(listing(Path.cwd()))
     said, code, faults = io.StringIO(), None, []
     engines.augment_episode = REAL if whole else fake_episode
+    logging.basicConfig(level=logging.INFO, stream=said, force=True)
     signal.alarm(LIMIT_S)
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):

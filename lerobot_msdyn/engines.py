@@ -12,6 +12,7 @@ from lerobot_msdyn.episode import depth_key_of
 from lerobot_msdyn.errors import ConfigError, EpisodeError, MsdynError
 from lerobot_msdyn.estimate import measure_speeds, predicted_seconds
 from lerobot_msdyn.pipeline import augment_episode, shared_backgrounds
+from lerobot_msdyn.video import quiet_encoders
 from lerobot_msdyn.write import NewEpisode, OutputDataset
 
 logger = logging.getLogger(__name__)
@@ -27,6 +28,7 @@ def run_local(
     """All episodes in this process; an episode that cannot be read is reported and left out."""
     if config.device == "cuda":
         raise ConfigError("device is 'cuda', which this version cannot draw on; use --device cpu")
+    quiet_encoders()
     _say_what_is_assumed(source, cameras, config)
     new: list[NewEpisode] = []
     failures: list[EpisodeError] = []

@@ -27,6 +27,7 @@ from lerobot_msdyn.rows import TIMESTAMP_TOLERANCE_S, first_line, read_rows, sou
 
 VIDEO_BACKEND = "pyav"
 CODEBASE_VERSION = "v3.0"
+VIDEO_ERRORS = (av.FFmpegError, OSError, ValueError, RuntimeError, IndexError)  # that a broken video can cause
 BLOCK_FRAMES = 256  # that are decoded at once
 MILLIMETRES = 1000.0
 
@@ -253,7 +254,7 @@ def read_depth(
         EpisodeError: a frame is absent or cannot be decoded.
     """
     if key in meta.video_keys:
-        encoder = DepthEncoderConfig.from_video_info(meta.features[key].get("info") or {})
+        encoder = _depth_encoder(meta, key)
         depth = dequantize_depth(
             _decode_video(meta, index, key, rows, is_depth=True).movedim(-1, 1),
             depth_min=encoder.depth_min,
@@ -266,6 +267,15 @@ def read_depth(
     images = [_decode_image(meta, index, key, item, cv2.IMREAD_UNCHANGED) for item in rows[key].to_pylist()]
     depth = torch.from_numpy(np.stack(images).astype(np.float32))
     return depth / depth_units_per_metre(meta, key), (0.0, float("inf"))
+
+
+def _depth_encoder(meta: LeRobotDatasetMetadata, key: str) -> DepthEncoderConfig:
+    try:
+        return DepthEncoderConfig.from_video_info(meta.features[key].get("info") or {})
+    except (ValueError, TypeError) as error:
+        raise EpisodeError(
+            f"{meta.repo_id}: {key} cannot be read with the settings in its info ({first_line(error)})"
+        ) from error
 
 
 def _decode_video(meta: LeRobotDatasetMetadata, index: int, key: str, rows: pa.Table, *, is_depth: bool) -> Tensor:
@@ -292,7 +302,7 @@ def _decode_video(meta: LeRobotDatasetMetadata, index: int, key: str, rows: pa.T
             frames[first : first + len(block)] = block
     except DatasetError as error:
         raise EpisodeError(f"{where}: {error}") from error
-    except (OSError, ValueError, RuntimeError, IndexError) as error:  # PyAV's errors are OSErrors and ValueErrors
+    except VIDEO_ERRORS as error:
         raise EpisodeError(
             f"{where}: {path} cannot be decoded for all of its {len(timestamps)} frames ({first_line(error)})"
         ) from error

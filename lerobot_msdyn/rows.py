@@ -13,6 +13,7 @@ from lerobot_msdyn.checks import PICTURE_DTYPES, TEXT_DTYPES, place_problem, reg
 from lerobot_msdyn.errors import DatasetError, EpisodeError
 
 TIMESTAMP_TOLERANCE_S = 1e-4  # LeRobot's
+KINDS = {"b": "b", "i": "iu", "u": "iu", "f": "fiu"}  # kind of a feature's dtype -> kinds that its cells may have
 
 
 def read_rows(meta: LeRobotDatasetMetadata, index: int) -> pa.Table:
@@ -34,10 +35,13 @@ def read_rows(meta: LeRobotDatasetMetadata, index: int) -> pa.Table:
     expected = int(row["length"])
     if rows.num_rows != expected or expected == 0:
         raise EpisodeError(f"{where}: {path} has {rows.num_rows} rows; expected {expected}")
-    lacking = [key for key, feature in meta.features.items() if feature["dtype"] != "video"]
-    lacking = sorted(set(lacking) - set(rows.column_names))
-    if lacking:
-        raise EpisodeError(f"{where}: {path} lacks the columns {', '.join(lacking)}")
+    columns = {key for key, feature in meta.features.items() if feature["dtype"] != "video"}
+    if columns != set(rows.column_names):
+        lacking, unknown = columns - set(rows.column_names), set(rows.column_names) - columns
+        raise EpisodeError(
+            f"{where}: {path} lacks the columns [{', '.join(sorted(lacking))}] and has [{', '.join(sorted(unknown))}], "
+            "which meta/info.json does not list"
+        )
     rows = rows.sort_by("frame_index") if pa.types.is_integer(rows["frame_index"].type) else rows
     problem = _rows_problem(rows, meta)
     if problem is not None:
@@ -73,6 +77,9 @@ def _rows_problem(rows: pa.Table, meta: LeRobotDatasetMetadata) -> str | None:
     for key, feature in meta.features.items():
         if feature["dtype"] in PICTURE_DTYPES + TEXT_DTYPES:
             continue
+        kind = np.asarray(rows[key].to_pylist()[:1]).dtype.kind if rows[key].null_count == 0 else "O"
+        if kind not in KINDS[np.dtype(feature["dtype"]).kind] + "O":
+            return f"{key} holds {rows[key].type}; meta/info.json says {feature['dtype']}"
         try:
             values = values_of(rows, key, feature)
         except (TypeError, ValueError, OverflowError):

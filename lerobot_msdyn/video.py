@@ -13,7 +13,7 @@ from lerobot.datasets.depth_utils import quantize_depth
 from lerobot.datasets.pyav_utils import write_u16_plane
 from lerobot.datasets.video_utils import decode_video_frames, get_video_duration_in_s
 
-from lerobot_msdyn.episode import VIDEO_BACKEND
+from lerobot_msdyn.episode import VIDEO_BACKEND, VIDEO_ERRORS
 from lerobot_msdyn.errors import EpisodeError, OutputError
 from lerobot_msdyn.files import DISK_FAULTS
 from lerobot_msdyn.rows import TIMESTAMP_TOLERANCE_S
@@ -22,8 +22,8 @@ MAX_LEVEL_ERROR = 16  # of 255; coding changes a frame's mean brightness by less
 
 
 def quiet_encoders() -> None:
-    """FFmpeg and the AV1 encoder write to stderr past every logger: let them write errors only."""
-    av.logging.set_libav_level(av.logging.ERROR)
+    """FFmpeg and the AV1 encoder write to stderr past every logger; what goes wrong is raised as well."""
+    av.logging.set_libav_level(av.logging.FATAL)
     os.environ.setdefault("SVT_LOG", "1")
 
 
@@ -125,7 +125,7 @@ def cut_video(
             _copy_packets(source, start_s, frames, fps, path)
         if frame_times(path) != [i / frame_rate(fps) for i in range(frames)]:
             _encode_anew(source, start_s, frames, fps, encoder, path)
-    except (OSError, ValueError, RuntimeError, IndexError) as error:
+    except VIDEO_ERRORS as error:
         if isinstance(error, OSError) and error.errno in DISK_FAULTS:
             raise
         raise EpisodeError(f"{source}: no {frames} frames from {start_s:.3f} s on ({type(error).__name__})") from error
@@ -167,7 +167,7 @@ def problem_of(
                     if abs(level - levels[count]) > MAX_LEVEL_ERROR:
                         return f"frame {count} has brightness {level:.0f}; {levels[count]:.0f} was drawn"
                 count += 1
-    except (OSError, ValueError, RuntimeError, IndexError) as error:  # PyAV's errors are OSErrors and ValueErrors
+    except VIDEO_ERRORS as error:
         return f"it cannot be decoded after {count} frames ({type(error).__name__})"
     return None if count == frames else f"it has {count} frames; expected {frames}"
 
