@@ -34,6 +34,7 @@ PLACES = ("chunk_index", "file_index")
 # Options of an encoder that name no file; others (x264's `stats`, x265's `csv`) could make it write anywhere.
 SAFE_OPTIONS = {"crf", "preset", "tune", "profile", "level", "qp", "bf", "refs", "threads", "row-mt", "cpu-used"}
 SAFE_PARAMS = {"lossless", "log-level", "crf", "preset", "tune", "keyint", "fast-decode", "lp", "film-grain"}
+DEPTH_NUMBERS = {"video.depth_min", "video.depth_max", "video.shift"}
 PARAMS_OPTIONS = {"x264-params", "x265-params", "svtav1-params"}
 
 
@@ -154,8 +155,13 @@ def _check_info(info: dict[str, Any], where: Path, *, has_video: bool) -> None:
                 raise DatasetError(f"{where}: {name} is {_short(info[name])}, {problem}")
 
 
-def _is_positive(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < math.inf
+def is_finite(value: object) -> bool:
+    """Whether a value is a number."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < math.inf
+
+
+def _is_positive(value: Any) -> bool:
+    return is_finite(value) and value > 0
 
 
 def template_problem(template: object, known: set[str]) -> str | None:
@@ -216,6 +222,8 @@ def _check_encoder(name: str, info: dict[str, Any]) -> None:
     for key, value in info.items():
         if key == "video.extra_options":
             _check_options(name, value)
+        elif key in DEPTH_NUMBERS and not (value is None or is_finite(value)):
+            raise DatasetError(f"{name} has {_short(key)}: {_short(value)}; expected a number")
         elif not isinstance(value, str | int | float | bool | None) or (
             isinstance(value, str) and not re.fullmatch(r"[\w .:+/-]{0,80}", value)
         ):

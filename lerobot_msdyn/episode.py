@@ -349,8 +349,10 @@ def picture_channels(meta: LeRobotDatasetMetadata, key: str) -> int:
 
 
 def encode_image(image: np.ndarray, suffix: str) -> bytes:
-    """An image file's content: colours uint8 [h,w,3], or depth [h,w] as it is stored."""
-    ok, content = cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image)
+    """An image file's content: colours uint8 [h,w,3] or [h,w,4], or grey or depth [h,w] as it is stored."""
+    if image.ndim == 3:
+        image = cv2.cvtColor(image, cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA)
+    ok, content = cv2.imencode(suffix, image)
     if not ok:
         raise EpisodeError(f"an image of shape {image.shape} cannot be encoded as {suffix}")
     return bytes(content.tobytes())

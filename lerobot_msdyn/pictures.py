@@ -137,6 +137,9 @@ def _in_stored_unit(depth: np.ndarray, unit: float) -> np.ndarray:
 
 
 def image_stats(samples: np.ndarray, scale: float = 255.0) -> dict[str, np.ndarray]:
-    """LeRobot's statistics per channel of sampled frames [n,c,h,w], divided by `scale`; shapes [c,1,1]."""
-    stats = get_feature_stats(samples, axis=(0, 2, 3), keepdims=True)
+    """LeRobot's statistics per channel of sampled frames [n,c,h,w], divided by `scale`; shapes [c,1,1].
+
+    Opacity has none: LeRobot accepts statistics of one or three channels.
+    """
+    stats = get_feature_stats(samples[:, :3], axis=(0, 2, 3), keepdims=True)
     return {name: value if name == "count" else np.squeeze(value / scale, axis=0) for name, value in stats.items()}

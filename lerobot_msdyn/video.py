@@ -28,7 +28,7 @@ def quiet_encoders() -> None:
 
 
 def frame_rate(fps: int | float) -> Fraction:
-    """A rate as video files hold it: 29.97 frames per second are 30000/1001."""
+    """A rate as video files hold it, e.g. 30000/1001."""
     return Fraction(fps).limit_denominator(1001)
 
 

@@ -311,9 +311,15 @@ class _Assembly:
         columns = {
             key: values_of(rows, key, feature)
             for key, feature in self.source.features.items()
-            if feature["dtype"] not in PICTURE_DTYPES + TEXT_DTYPES and key in rows.column_names
+            if feature["dtype"] not in PICTURE_DTYPES + TEXT_DTYPES
         }
-        return compute_episode_stats(columns, self.source.features)
+        # LeRobot's are per last axis where there are several, except for a single row: made alike, so that they add up.
+        nested = [key for key, values in columns.items() if values.ndim > 2]
+        columns |= {key: columns[key].reshape(-1, columns[key].shape[-1]) for key in nested}
+        stats: Stats = compute_episode_stats(columns, self.source.features)
+        for key in nested:
+            stats[key]["count"] = np.array([rows.num_rows])
+        return stats
 
 
 def _check_times(path: Path, frames: int, fps: int | float) -> None:
