@@ -206,6 +206,8 @@ class Recipe:
     variants: int = 2
     # Whether the source episodes are copied into the output as well.
     include_source: bool = True
+    # Whether recorded depth of a re-rendered camera is rendered as well; else it is copied, and shows the old view.
+    render_depth: bool = True
     # Seed of every random choice; together with the episode and the variant it fixes the result.
     seed: int = 0
     # auto, cpu or cuda.

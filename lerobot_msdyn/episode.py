@@ -1,6 +1,7 @@
 """Read LeRobot episodes into plain tensors: pixels, cameras, recorded depth, state and action."""
 
 import io
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ from lerobot_msdyn.rows import TIMESTAMP_TOLERANCE_S, first_line, read_rows, sou
 VIDEO_BACKEND = "pyav"
 CODEBASE_VERSION = "v3.0"
 VIDEO_ERRORS = (av.FFmpegError, OSError, ValueError, RuntimeError, IndexError)  # that a broken video can cause
-BLOCK_FRAMES = 256  # that are decoded at once
+BLOCK_FRAMES = 128  # that are decoded at once
 MILLIMETRES = 1000.0
 
 
@@ -240,7 +241,7 @@ def read_colour(meta: LeRobotDatasetMetadata, index: int, key: str, rows: pa.Tab
         EpisodeError: a frame is absent or cannot be decoded.
     """
     if key in meta.video_keys:
-        return _decode_video(meta, index, key, rows, is_depth=False)
+        return _decode_video(meta, index, key, rows, lambda block: block.movedim(1, -1))
     images = [_decode_image(meta, index, key, item, cv2.IMREAD_COLOR_RGB) for item in rows[key].to_pylist()]
     return torch.from_numpy(np.stack(images))
 
@@ -255,15 +256,20 @@ def read_depth(
     """
     if key in meta.video_keys:
         encoder = _depth_encoder(meta, key)
-        depth = dequantize_depth(
-            _decode_video(meta, index, key, rows, is_depth=True).movedim(-1, 1),
-            depth_min=encoder.depth_min,
-            depth_max=encoder.depth_max,
-            shift=encoder.shift,
-            use_log=encoder.use_log,
-            output_unit="m",
-        )
-        return depth[:, 0].float(), (encoder.depth_min, encoder.depth_max)
+
+        def in_metres(block: Tensor) -> Tensor:
+            depth = dequantize_depth(
+                block,
+                depth_min=encoder.depth_min,
+                depth_max=encoder.depth_max,
+                shift=encoder.shift,
+                use_log=encoder.use_log,
+                output_unit="m",
+            )
+            return depth[:, 0].float()
+
+        depth = _decode_video(meta, index, key, rows, in_metres, is_depth=True)
+        return depth, (encoder.depth_min, encoder.depth_max)
     images = [_decode_image(meta, index, key, item, cv2.IMREAD_UNCHANGED) for item in rows[key].to_pylist()]
     depth = torch.from_numpy(np.stack(images).astype(np.float32))
     return depth / depth_units_per_metre(meta, key), (0.0, float("inf"))
@@ -278,8 +284,16 @@ def _depth_encoder(meta: LeRobotDatasetMetadata, key: str) -> DepthEncoderConfig
         ) from error
 
 
-def _decode_video(meta: LeRobotDatasetMetadata, index: int, key: str, rows: pa.Table, *, is_depth: bool) -> Tensor:
-    """All frames of a video [t,h,w,c], decoded in blocks, so that they are in memory once."""
+def _decode_video(
+    meta: LeRobotDatasetMetadata,
+    index: int,
+    key: str,
+    rows: pa.Table,
+    wanted: Callable[[Tensor], Tensor],
+    *,
+    is_depth: bool = False,
+) -> Tensor:
+    """What is wanted of all frames of a video, made from some [b,c,h,w] at a time, so that it is in memory once."""
     path = source_file(meta, index, meta.get_video_file_path(index, key))
     start = float(meta.episodes[index][f"videos/{key}/from_timestamp"])
     timestamps = [start + float(t) for t in rows["timestamp"].to_pylist()]
@@ -289,24 +303,26 @@ def _decode_video(meta: LeRobotDatasetMetadata, index: int, key: str, rows: pa.T
     try:
         _check_stream(path, width, height)
         for first in range(0, len(timestamps), BLOCK_FRAMES):
-            block = decode_video_frames(
+            decoded = decode_video_frames(
                 path,
                 timestamps[first : first + BLOCK_FRAMES],
                 TIMESTAMP_TOLERANCE_S,
                 VIDEO_BACKEND,
                 return_uint8=True,
                 is_depth=is_depth,
-            ).movedim(1, -1)
+            )
+            block = wanted(decoded)
             if frames is None:
                 frames = block.new_empty(len(timestamps), *block.shape[1:])
             frames[first : first + len(block)] = block
     except DatasetError as error:
         raise EpisodeError(f"{where}: {error}") from error
-    except VIDEO_ERRORS as error:
+    except (*VIDEO_ERRORS, TypeError) as error:  # TypeError: settings of the depth's codes
         raise EpisodeError(
             f"{where}: {path} cannot be decoded for all of its {len(timestamps)} frames ({first_line(error)})"
         ) from error
-    assert frames is not None
+    if frames is None:
+        raise EpisodeError(f"{where}: the episode has no frames")
     return frames
 
 

@@ -180,7 +180,8 @@ def _rendered(
         pictures[key] = new_pictures(scene, perturb(scene.camera, offset))
     priors = {key: scene.provenance for key, scene in scenes.items()}
     provenance = Provenance(source.repo_id, index, variant, recipe.seed, drawn, priors)
-    return output.stage(index, variant, by_feature(source, pictures), provenance)
+    frames = by_feature(source, pictures, depth=recipe.render_depth)
+    return output.stage(index, variant, frames, provenance)
 
 
 def reconstruct(
@@ -299,14 +300,14 @@ def _one_torch_thread() -> Iterator[None]:
 
 
 def by_feature(
-    source: LeRobotDatasetMetadata, pictures: dict[str, Iterator[Picture]]
+    source: LeRobotDatasetMetadata, pictures: dict[str, Iterator[Picture]], *, depth: bool = True
 ) -> Iterator[dict[str, np.ndarray]]:
-    """Per time, feature -> picture: the cameras in step, and the depth of those that have a depth feature."""
+    """Per time, feature -> picture: the cameras in step, and the depth (if wanted) of those that have it recorded."""
     for together in zip(*pictures.values(), strict=True):
         features: dict[str, np.ndarray] = {}
         for key, picture in zip(pictures, together, strict=True):
             features[key] = picture.rgb
-            depth_key = depth_key_of(source, key)
+            depth_key = depth_key_of(source, key) if depth else None
             if depth_key is not None:
                 features[depth_key] = picture.depth
         yield features
