@@ -74,6 +74,8 @@ class SceneConfig:
     mask_border_px: int = 1
     # Side of the voxels in which the gathered moving points are merged, in pixels of the fitted image.
     moving_voxel_px: float = 0.8
+    # Whether what the motion does not explain of a frame is shown as it was recorded, at that frame.
+    overlay: bool = True
     # Balls instead of ellipsoids.
     isotropic: bool = False
 

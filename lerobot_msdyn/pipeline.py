@@ -34,6 +34,7 @@ from lerobot_msdyn.shared import (
     share_backgrounds,
 )
 from lerobot_msdyn.staging import SCENE
+from lerobot_msdyn.unexplained import unexplained
 from lerobot_msdyn.write import NewEpisode, OutputDataset
 
 logger = logging.getLogger(__name__)
@@ -276,6 +277,8 @@ def _fit_window(
         seed=recipe.seed,
         progress=lambda done: progress(done / steps),
     )
+    if settings.overlay:
+        result = replace(result, scene=replace(result.scene, overlay=unexplained(result.scene, view, priors)))
     return result, priors, distance, view.camera
 
 
