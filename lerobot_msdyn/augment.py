@@ -65,10 +65,15 @@ def run(arguments: list[str]) -> int:
 
 def _open(config: AugmentConfig, root: Path | None) -> tuple["LeRobotDatasetMetadata", list[int], list[str]]:
     """The source, its episodes and its cameras."""
+    from lerobot_msdyn.action_safety import still_cameras
     from lerobot_msdyn.episode import open_source, select_cameras, select_episodes
 
     source = open_source(config.repo_id, root)
-    return source, select_episodes(source, config.episodes), select_cameras(source, config.cameras)
+    episodes = select_episodes(source, config.episodes)
+    cameras = select_cameras(source, config.cameras, allow_moving=config.allow_moving)
+    if not config.allow_moving:
+        cameras = still_cameras(source, episodes[0], cameras, config)
+    return source, episodes, cameras
 
 
 def _convert(
@@ -105,7 +110,8 @@ def augment(
     with OutputDataset(source, new_repo_id, new_root, staging) as output:
         new, failures = run_local(source, episodes, cameras, config, output)
         if not new:
-            raise EpisodeError(f"no episode could be augmented; nothing was written. First: {failures[0]}")
+            first = failures[0] if failures else "every new view was rejected, see above; allow more by --max_unseen"
+            raise EpisodeError(f"no episode could be augmented; nothing was written. First: {first}")
         output.finish(new, recipe_text(config), [str(failure) for failure in failures])
     rendered = sum(episode.provenance.variant != SOURCE_VARIANT for episode in new)
     return _say_skipped(

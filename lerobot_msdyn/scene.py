@@ -103,18 +103,20 @@ class Snapshot:
     opacities: Float[Tensor, " g"]
     rgb: Float[Tensor, "b g 3"]
     moving: Float[Tensor, " g"]  # 1 for the moving set, 0 for the static one
+    extra: Float[Tensor, " g"] | None = None  # another value of each
 
 
 def patched(snapshot: Snapshot, patch: FramePatch) -> Snapshot:
     """A snapshot of one frame, with a patch in place of what the patch hides; the patch counts as moving."""
-    kept = ~patch.hidden
+    kept, ones = ~patch.hidden, torch.ones(len(patch))
     return Snapshot(
         means=torch.cat((snapshot.means[:, kept], patch.means[None]), dim=1),
         quats=torch.cat((snapshot.quats[:, kept], patch.quats[None]), dim=1),
         scales=torch.cat((snapshot.scales[kept], patch.log_scales.exp())),
-        opacities=torch.cat((snapshot.opacities[kept], torch.full((len(patch),), PATCH_OPACITY))),
+        opacities=torch.cat((snapshot.opacities[kept], PATCH_OPACITY * ones)),
         rgb=torch.cat((snapshot.rgb[:, kept], patch.rgb[None]), dim=1),
-        moving=torch.cat((snapshot.moving[kept], torch.ones(len(patch)))),
+        moving=torch.cat((snapshot.moving[kept], ones)),
+        extra=None if snapshot.extra is None else torch.cat((snapshot.extra[kept], ones)),
     )
 
 

@@ -26,7 +26,7 @@ from lerobot_msdyn.copies import stage_copies
 from lerobot_msdyn.errors import OutputError
 from lerobot_msdyn.files import temporary_files_in, writing
 from lerobot_msdyn.pictures import StagedPictures, Stats, stage_pictures
-from lerobot_msdyn.provenance import Provenance, write_provenance
+from lerobot_msdyn.provenance import Provenance, write_provenance, write_unseen
 from lerobot_msdyn.rows import TIMESTAMP_TOLERANCE_S, read_rows, values_of
 from lerobot_msdyn.staging import FINISHED, SCENE, Kept, Staging
 from lerobot_msdyn.video import frame_times
@@ -41,6 +41,7 @@ class NewEpisode:
     source_index: int
     provenance: Provenance
     pictures: StagedPictures = field(default_factory=StagedPictures)  # none for a copy of the source's episode
+    masks: Mapping[str, np.ndarray] = field(default_factory=dict)  # of what was never seen, see `write_unseen`
 
 
 class OutputDataset:
@@ -132,6 +133,9 @@ class OutputDataset:
             shutil.rmtree(folder, ignore_errors=True)
             _Assembly(self.source, self.repo_id, folder, self.copies).build(episodes)
             write_provenance(folder, [episode.provenance for episode in episodes], recipe_yaml)
+            for number, episode in enumerate(episodes):
+                if episode.masks:
+                    write_unseen(folder, number, episode.masks)
             write_card(folder, self.repo_id, licence_of(self.source.root))
             if self.root.exists():
                 raise OutputError(f"{self.root} appeared while the dataset was made; it was left as it is")

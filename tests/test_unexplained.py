@@ -10,7 +10,7 @@ from lerobot_msdyn.background import background_gaussians, pixel_gaussians
 from lerobot_msdyn.cameras import CameraTrack, intrinsics_from_fov, static_camera
 from lerobot_msdyn.episode import View
 from lerobot_msdyn.motion.bases import identity_level
-from lerobot_msdyn.perturbation import orbit_offset, perturb
+from lerobot_msdyn.perturbation import orbit_offset
 from lerobot_msdyn.priors import PointTracks, Priors
 from lerobot_msdyn.rendering import draw
 from lerobot_msdyn.scene import DynamicScene, load_scene, save_scene
@@ -63,7 +63,7 @@ def test_the_recorded_camera_sees_what_it_recorded(recorded: tuple[DynamicScene,
 def test_another_camera_sees_it_at_its_depth(recorded: tuple[DynamicScene, View, Priors]) -> None:
     scene, view, priors = recorded
     mended = dataclasses.replace(scene, overlay=unexplained(scene, view, priors))
-    elsewhere = perturb(view.camera, orbit_offset(8.0, 0.0, FAR))
+    elsewhere = dataclasses.replace(view.camera, world_from_camera=orbit_offset(8.0, 0.0, FAR).expand(FRAMES, 4, 4))
     found = red(mended, elsewhere, 3).nonzero().float().mean(0)
     here = red(mended, view.camera, 3).nonzero().float().mean(0)
     # Before the point at which both look, things move to the left as the camera moves to the right.
