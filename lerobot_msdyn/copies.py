@@ -39,15 +39,12 @@ def _cut(source: LeRobotDatasetMetadata, index: int, key: str, path: Path) -> Pa
     episode = source.episodes[index]
     length = int(episode["length"])
     file = source_file(source, index, source.get_video_file_path(index, key))
+    start = float(episode[f"videos/{key}/from_timestamp"])
     with whole_file(path) as part:
-        cut_video(
-            file,
-            float(episode[f"videos/{key}/from_timestamp"]),
-            length,
-            source.fps,
-            encoder_of(source.features[key], key),
-            part,
-        )
+        try:
+            cut_video(file, start, length, source.fps, encoder_of(source.features[key], key), part)
+        except EpisodeError as error:
+            raise EpisodeError(f"{source.repo_id} episode {index}, {key}: {error}") from error
         height, width, _ = picture_size(source.features[key])
         problem = problem_of(part, length, source.fps, (width, height))
     if problem is not None:

@@ -160,8 +160,7 @@ def test_language_columns(tmp_path: Path) -> None:
     for path in sorted((root / "data").rglob("*.parquet")):
         table = pq.read_table(path)
         for name, kind in kinds.items():
-            names = [item.name for item in kind.value_type]
-            table = table.append_column(name, pa.array([[{key: row.get(key) for key in names}]] * len(table), kind))
+            table = table.append_column(name, one_each(kind, row, len(table)))
         pq.write_table(table.replace_schema_metadata(None), path)
     listed = {key: value | {"shape": list(value["shape"])} for key, value in language_feature_info().items()}
     change(root, lambda info: info["features"].update(listed))
@@ -172,6 +171,16 @@ def test_language_columns(tmp_path: Path) -> None:
     for name in kinds:
         assert new[name].to_pylist() == old[name].to_pylist() != []
         assert new[name].type == old[name].type
+
+
+def one_each(kind: pa.ListType, row: dict[str, Any], count: int) -> pa.Array:
+    """Lists of one struct each; what is neither text nor a number (JSON of tool calls) is empty."""
+    columns = []
+    for item in kind.value_type:
+        plain = pa.types.is_string(item.type) or pa.types.is_floating(item.type)
+        columns.append(pa.array([row.get(item.name)] * count, item.type) if plain else pa.nulls(count, item.type))
+    rows = pa.StructArray.from_arrays(columns, fields=list(kind.value_type))
+    return pa.ListArray.from_arrays(pa.array(range(count + 1), pa.int32()), rows, type=kind)
 
 
 def test_a_rate_that_is_no_whole_number(desk: Path, tmp_path: Path) -> None:
