@@ -28,7 +28,8 @@ from lerobot_msdyn.rows import TIMESTAMP_TOLERANCE_S, first_line, read_rows, sou
 
 VIDEO_BACKEND = "pyav"
 CODEBASE_VERSION = "v3.0"
-VIDEO_ERRORS = (av.FFmpegError, OSError, ValueError, RuntimeError, IndexError)  # that a broken video can cause
+# What a broken video can cause; AttributeError: a stream of an unknown codec has no context.
+VIDEO_ERRORS = (av.FFmpegError, OSError, ValueError, RuntimeError, IndexError, AttributeError)
 BLOCK_FRAMES = 128  # that are decoded at once
 MILLIMETRES = 1000.0
 ON_ROBOT = ("wrist", "hand", "gripper", "palm", "finger", "effector", "flange", "tool")  # in names of cameras
