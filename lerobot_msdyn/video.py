@@ -119,6 +119,9 @@ def cut_video(
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
+        with av.open(str(source)) as container:
+            if container.streams.video[0].codec_context is None:  # copying such a stream would crash PyAV
+                raise ValueError("unknown codec")
         if start_s == 0 and abs(get_video_duration_in_s(source) * fps - frames) < 0.5:
             shutil.copyfile(source, path)
         else:
