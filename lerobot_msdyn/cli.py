@@ -144,7 +144,7 @@ def run_command(main: Callable[[list[str]], int], arguments: list[str] | None = 
         sys.stderr.write(f"error: {_one_line(error)}\n")
         code = EXIT_BAD_INPUT
     except KeyboardInterrupt:
-        sys.stderr.write("interrupted: nothing was written to the output folder\n")
+        sys.stderr.write("interrupted: nothing was written\n")
         code = EXIT_INTERRUPTED
     sys.exit(code)
 

@@ -313,6 +313,8 @@ class Recipe:
     variants: int = 2
     # Whether the source episodes are copied into the output as well.
     include_source: bool = True
+    # Whether recorded depth of a re-rendered camera is rendered as well; else it is copied, and shows the old view.
+    render_depth: bool = True
     # Seed of every random choice; together with the episode and the variant it fixes the result.
     seed: int = 0
     # auto, cpu or cuda.
@@ -358,6 +360,30 @@ class AugmentConfig(Recipe):
     episodes: list[int] | None = None
     # Report what would be done (episodes, disk, time) and stop.
     dry_run: bool = False
+    # Throw away what an unfinished run for the same output has finished, instead of going on with it.
+    restart: bool = False
+    # Work on a converted copy of a source of version v2.1; the source stays as it is.
+    convert: bool = False
+
+
+@dataclass
+class SplitConfig:
+    """`python -m lerobot_msdyn.split`: flags for lerobot-train that hold out whole recordings."""
+
+    # Exact folder of the dataset.
+    root: Path | None = None
+    # Share of each task's recordings that is held out.
+    eval_split: float = 0.2
+
+
+@dataclass
+class CarryConfig:
+    """`python -m lerobot_msdyn.carry`: meta/msdyn/ for what LeRobot's tools made of other datasets."""
+
+    # Exact folder of the dataset that gets it.
+    root: Path | None = None
+    # Exact folders of the datasets that it was made from, e.g. '[A, B]'.
+    sources: list[Path] = field(default_factory=list)
 
 
 @dataclass

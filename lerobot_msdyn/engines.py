@@ -1,5 +1,6 @@
 """Who runs which episode: for now this process, one after the other."""
 
+import functools
 import logging
 
 from lerobot.datasets import LeRobotDatasetMetadata
@@ -12,6 +13,7 @@ from lerobot_msdyn.errors import ConfigError, EpisodeError, MsdynError
 from lerobot_msdyn.estimate import measure_speeds, predicted_seconds
 from lerobot_msdyn.pipeline import augment_episode
 from lerobot_msdyn.sharing import shared_backgrounds
+from lerobot_msdyn.video import quiet_encoders
 from lerobot_msdyn.write import NewEpisode, OutputDataset
 
 logger = logging.getLogger(__name__)
@@ -27,6 +29,7 @@ def run_local(
     """All episodes in this process; an episode that cannot be read is reported and left out."""
     if config.device == "cuda":
         raise ConfigError("device is 'cuda', which this version cannot draw on; use --device cpu")
+    quiet_encoders()
     _say_what_is_assumed(source, cameras, config)
     new: list[NewEpisode] = []
     failures: list[EpisodeError] = []
@@ -39,10 +42,11 @@ def run_local(
             bar.update(min(share, len(episodes) - bar.n))  # shares add up to one only up to rounding
 
         bar.set_description_str("looking at the background")
-        backgrounds = shared_backgrounds(source, cameras, config)
+        backgrounds = output.staging.keep("backgrounds", lambda: shared_backgrounds(source, cameras, config))
         for done, index in enumerate(episodes, start=1):
             try:
-                new += augment_episode(source, index, cameras, config, output, progress, backgrounds)
+                make = functools.partial(augment_episode, source, index, cameras, config, output, progress, backgrounds)
+                new += output.finish_episode(index, make)
             except EpisodeError as error:
                 logger.error("skipped: %s", error)
                 failures.append(error)

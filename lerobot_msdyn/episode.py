@@ -1,32 +1,36 @@
 """Read LeRobot episodes into plain tensors: pixels, cameras, recorded depth, state and action."""
 
-import json
+import io
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import av
 import cv2
-import httpx
 import numpy as np
+import PIL.Image
 import pyarrow as pa
-import pyarrow.parquet as pq
 import torch
 from jaxtyping import Float, UInt8
 from lerobot.configs import DepthEncoderConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.datasets.depth_utils import dequantize_depth
-from lerobot.datasets.utils import CompatibilityError
 from lerobot.datasets.video_utils import decode_video_frames
 from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, OBS_STATE
 from torch import Tensor
 
 from lerobot_msdyn.cameras import CameraTrack, intrinsics_from_fov, read_calibration, static_camera
+from lerobot_msdyn.checks import check_metadata, picture_size, read_json
 from lerobot_msdyn.config import CameraConfig
 from lerobot_msdyn.errors import DatasetError, EpisodeError
+from lerobot_msdyn.rows import TIMESTAMP_TOLERANCE_S, first_line, read_rows, source_file, task_of
 
 VIDEO_BACKEND = "pyav"
-TIMESTAMP_TOLERANCE_S = 1e-4
 CODEBASE_VERSION = "v3.0"
+# What a broken video can cause; AttributeError: a stream of an unknown codec has no context.
+VIDEO_ERRORS = (av.FFmpegError, OSError, ValueError, RuntimeError, IndexError, AttributeError)
+BLOCK_FRAMES = 128  # that are decoded at once
 MILLIMETRES = 1000.0
 ON_ROBOT = ("wrist", "hand", "gripper", "palm", "finger", "effector", "flange", "tool")  # in names of cameras
 
@@ -55,7 +59,7 @@ class Episode:
     """One recorded episode; the views are those that were asked for."""
 
     source: EpisodeSource
-    fps: int
+    fps: int | float
     time: Float[Tensor, " t"]  # s since the episode's start
     views: dict[str, View]
     state: Float[Tensor, "t s"] | None
@@ -70,48 +74,50 @@ def open_source(repo_id: str, root: Path | None = None) -> LeRobotDatasetMetadat
     """The metadata of a dataset in `root`, else in LeRobot's home, else on the hub. Nothing is written to `root`.
 
     Raises:
-        DatasetError: there is no such dataset, or it is not of version v3.0.
+        DatasetError: there is no such dataset, it is not of version v3.0, or its metadata is not what it should be.
     """
     folder = HF_LEROBOT_HOME / repo_id if root is None else root
-    info_path = folder / "meta" / "info.json"
-    if root is not None and not info_path.is_file():
-        raise DatasetError(
-            f"no dataset in {root}: {info_path} is absent; "
-            "--root is the exact folder that holds meta/, data/ and videos/"
-        )
-    if info_path.is_file():
-        _check_version(info_path)
-    try:
-        return LeRobotDatasetMetadata(repo_id, root)
-    except (OSError, ValueError, KeyError, TypeError, CompatibilityError, httpx.HTTPError) as error:
-        if info_path.is_file():
+    if not (folder / "meta" / "info.json").exists():
+        if root is not None:
             raise DatasetError(
-                f"{folder}: the dataset's meta/ cannot be read ({type(error).__name__}: {error})"
-            ) from error
+                f"no dataset in {root}: {root / 'meta' / 'info.json'} is absent; "
+                "--root is the exact folder that holds meta/, data/ and videos/"
+            )
+        folder = _from_hub(repo_id, folder)
+    check_version(folder)
+    check_metadata(folder)
+    try:
+        return LeRobotDatasetMetadata(repo_id, folder)
+    except Exception as error:  # several libraries read the metadata, each with errors of its own
+        raise DatasetError(f"{folder}: the dataset's meta/ cannot be read ({first_line(error)})") from error
+
+
+def _from_hub(repo_id: str, folder: Path) -> Path:
+    """Where LeRobot put a dataset that it downloaded."""
+    try:
+        return LeRobotDatasetMetadata(repo_id).root
+    except Exception as error:
         raise DatasetError(
             f"no dataset {repo_id!r}: not in {folder}, and the hub does not have it or cannot be reached "
             f"({type(error).__name__}); give its folder with --root"
         ) from error
 
 
-def _check_version(info_path: Path) -> None:
-    try:
-        version = json.loads(info_path.read_text()).get("codebase_version")
-    except (OSError, ValueError, AttributeError) as error:
-        raise DatasetError(f"{info_path} is not readable JSON ({error})") from error
+def check_version(root: Path) -> None:
+    """Whether a dataset is of the version that this LeRobot reads.
+
+    Raises:
+        DatasetError: it is not; the way to convert it is named.
+    """
+    version = read_json(root, "meta/info.json").get("codebase_version")
     if version == "v2.1":
-        todo = (
-            "convert a copy of it with "
-            "`python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=NAME --root=FOLDER --push-to-hub=false`"
-        )
+        todo = "add --convert to work on a converted copy of it (the source stays as it is)"
     elif str(version).startswith(("v1", "v2")):
-        todo = "convert it to v2.1 with an older LeRobot first, then with lerobot.scripts.convert_dataset_v21_to_v30"
+        todo = "convert it to v2.1 with an older LeRobot first, then add --convert"
     else:
         todo = "use a LeRobot and an lerobot_msdyn that know this version"
     if version != CODEBASE_VERSION:
-        raise DatasetError(
-            f"{info_path.parent.parent} is a LeRobot dataset of version {version}; expected {CODEBASE_VERSION}; {todo}"
-        )
+        raise DatasetError(f"{root} is a LeRobot dataset of version {version}; expected {CODEBASE_VERSION}; {todo}")
 
 
 def select_episodes(meta: LeRobotDatasetMetadata, episodes: list[int] | None) -> list[int]:
@@ -171,37 +177,6 @@ def is_wrist_camera(key: str) -> bool:
     return any(word in name for word in ON_ROBOT)
 
 
-def read_rows(meta: LeRobotDatasetMetadata, index: int) -> pa.Table:
-    """The parquet rows of one episode, in order and bit for bit.
-
-    Raises:
-        EpisodeError: the data file is absent, damaged, or has another number of rows than the metadata says.
-    """
-    path = inside_root(meta, meta.get_data_file_path(index))
-    try:
-        rows = pq.read_table(path, filters=[("episode_index", "=", index)])
-    except (OSError, pa.ArrowException) as error:
-        raise EpisodeError(f"{meta.repo_id} episode {index}: {path} cannot be read ({_first_line(error)})") from error
-    expected = int(meta.episodes[index]["length"])
-    if rows.num_rows != expected or expected == 0:
-        raise EpisodeError(f"{meta.repo_id} episode {index}: {path} has {rows.num_rows} rows; expected {expected}")
-    return rows.sort_by("frame_index")
-
-
-def inside_root(meta: LeRobotDatasetMetadata, relative: Path) -> Path:
-    """The file of a dataset at a path that its metadata gives; such a path may not leave the dataset's folder.
-
-    Raises:
-        DatasetError: it does.
-    """
-    path = (meta.root / relative).resolve()
-    if not path.is_relative_to(meta.root.resolve()):
-        raise DatasetError(
-            f"{meta.repo_id}: its metadata names {relative}, which is outside of {meta.root}; refusing to read it"
-        )
-    return path
-
-
 def read_episode(
     meta: LeRobotDatasetMetadata, index: int, cameras: list[str], config: CameraConfig, *, recorded_depth: bool = True
 ) -> Episode:
@@ -227,7 +202,6 @@ def read_episode(
                     "only depth that is aligned to the colour image can be used (--priors.depth plane goes without)"
                 )
         views[key] = View(rgb, make_camera(key, index, rgb, config), depth, depth_range)
-    task = str(meta.tasks.iloc[int(rows["task_index"][0].as_py())].name)
     return Episode(
         source=EpisodeSource(meta.repo_id, meta.root, index),
         fps=meta.fps,
@@ -235,7 +209,7 @@ def read_episode(
         views=views,
         state=_matrix(rows, OBS_STATE),
         action=_matrix(rows, ACTION),
-        task=task,
+        task=task_of(meta, rows),
     )
 
 
@@ -275,8 +249,7 @@ def read_colour(meta: LeRobotDatasetMetadata, index: int, key: str, rows: pa.Tab
         EpisodeError: a frame is absent or cannot be decoded.
     """
     if key in meta.video_keys:
-        frames = _decode_video(meta, index, key, rows, is_depth=False)
-        return frames.permute(0, 2, 3, 1).contiguous()
+        return _decode_video(meta, index, key, rows, lambda block: block.movedim(1, -1))
     images = [_decode_image(meta, index, key, item, cv2.IMREAD_COLOR_RGB) for item in rows[key].to_pylist()]
     return torch.from_numpy(np.stack(images))
 
@@ -290,52 +263,120 @@ def read_depth(
         EpisodeError: a frame is absent or cannot be decoded.
     """
     if key in meta.video_keys:
-        encoder = DepthEncoderConfig.from_video_info(meta.features[key].get("info") or {})
-        depth = dequantize_depth(
-            _decode_video(meta, index, key, rows, is_depth=True),
-            depth_min=encoder.depth_min,
-            depth_max=encoder.depth_max,
-            shift=encoder.shift,
-            use_log=encoder.use_log,
-            output_unit="m",
-        )
-        return depth[:, 0].float(), (encoder.depth_min, encoder.depth_max)
+        encoder = _depth_encoder(meta, key)
+
+        def in_metres(block: Tensor) -> Tensor:
+            depth = dequantize_depth(
+                block,
+                depth_min=encoder.depth_min,
+                depth_max=encoder.depth_max,
+                shift=encoder.shift,
+                use_log=encoder.use_log,
+                output_unit="m",
+            )
+            return depth[:, 0].float()
+
+        depth = _decode_video(meta, index, key, rows, in_metres, is_depth=True)
+        return depth, (encoder.depth_min, encoder.depth_max)
     images = [_decode_image(meta, index, key, item, cv2.IMREAD_UNCHANGED) for item in rows[key].to_pylist()]
     depth = torch.from_numpy(np.stack(images).astype(np.float32))
     return depth / depth_units_per_metre(meta, key), (0.0, float("inf"))
 
 
-def _decode_video(meta: LeRobotDatasetMetadata, index: int, key: str, rows: pa.Table, *, is_depth: bool) -> Tensor:
-    path = inside_root(meta, meta.get_video_file_path(index, key))
-    start = float(meta.episodes[index][f"videos/{key}/from_timestamp"])
-    timestamps = [start + float(t) for t in rows["timestamp"].to_pylist()]
-    where = f"{meta.repo_id} episode {index}, {key}"
-    if not path.is_file():
-        raise EpisodeError(f"{where}: {path} is absent")
+def _depth_encoder(meta: LeRobotDatasetMetadata, key: str) -> DepthEncoderConfig:
     try:
-        return decode_video_frames(
-            path, timestamps, TIMESTAMP_TOLERANCE_S, VIDEO_BACKEND, return_uint8=True, is_depth=is_depth
-        )
-    except (OSError, ValueError, RuntimeError, IndexError) as error:  # PyAV's errors are OSErrors and ValueErrors
+        return DepthEncoderConfig.from_video_info(meta.features[key].get("info") or {})
+    except (ValueError, TypeError) as error:
         raise EpisodeError(
-            f"{where}: {path} cannot be decoded for all of its {len(timestamps)} frames ({_first_line(error)})"
+            f"{meta.repo_id}: {key} cannot be read with the settings in its info ({first_line(error)})"
         ) from error
 
 
-def _decode_image(meta: LeRobotDatasetMetadata, index: int, key: str, item: dict[str, Any], flags: int) -> np.ndarray:
+def _decode_video(
+    meta: LeRobotDatasetMetadata,
+    index: int,
+    key: str,
+    rows: pa.Table,
+    wanted: Callable[[Tensor], Tensor],
+    *,
+    is_depth: bool = False,
+) -> Tensor:
+    """What is wanted of all frames of a video, made from some [b,c,h,w] at a time, so that it is in memory once."""
+    path = source_file(meta, index, meta.get_video_file_path(index, key))
+    start = float(meta.episodes[index][f"videos/{key}/from_timestamp"])
+    timestamps = [start + float(t) for t in rows["timestamp"].to_pylist()]
+    where = f"{meta.repo_id} episode {index}, {key}"
+    height, width, _ = picture_size(meta.features[key])
+    frames: Tensor | None = None
+    try:
+        _check_stream(path, width, height)
+        for first in range(0, len(timestamps), BLOCK_FRAMES):
+            decoded = decode_video_frames(
+                path,
+                timestamps[first : first + BLOCK_FRAMES],
+                TIMESTAMP_TOLERANCE_S,
+                VIDEO_BACKEND,
+                return_uint8=True,
+                is_depth=is_depth,
+            )
+            block = wanted(decoded)
+            if frames is None:
+                frames = block.new_empty(len(timestamps), *block.shape[1:])
+            frames[first : first + len(block)] = block
+    except DatasetError as error:
+        raise EpisodeError(f"{where}: {error}") from error
+    except (*VIDEO_ERRORS, TypeError) as error:  # TypeError: settings of the depth's codes
+        raise EpisodeError(
+            f"{where}: {path} cannot be decoded for all of its {len(timestamps)} frames ({first_line(error)})"
+        ) from error
+    if frames is None:
+        raise EpisodeError(f"{where}: the episode has no frames")
+    return frames
+
+
+def _check_stream(path: Path, width: int, height: int) -> None:
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0].codec_context
+        if (stream.width, stream.height) != (width, height):
+            raise DatasetError(
+                f"{path} is {stream.width}x{stream.height}; meta/info.json says {width}x{height}: correct its shape"
+            )
+
+
+def _decode_image(meta: LeRobotDatasetMetadata, index: int, key: str, item: Any, flags: int) -> np.ndarray:
     """One image of an image feature: the bytes in the parquet row, else the file that it names inside the dataset."""
-    content = item["bytes"]
+    where = f"{meta.repo_id} episode {index}, {key}"
+    content, name = (item or {}).get("bytes"), (item or {}).get("path")
     if content is None:
-        content = inside_root(meta, Path(item["path"])).read_bytes()
+        if not name:
+            raise EpisodeError(f"{where}: a frame has no image")
+        content = source_file(meta, index, Path(name)).read_bytes()
+    height, width, _ = picture_size(meta.features[key])
+    try:
+        with PIL.Image.open(io.BytesIO(content)) as header:
+            size = header.size
+    except (OSError, ValueError, SyntaxError, PIL.Image.DecompressionBombError) as error:
+        raise EpisodeError(f"{where}: an image of {len(content)} bytes cannot be decoded") from error
+    if size != (width, height):
+        raise EpisodeError(
+            f"{where}: an image is {size[0]}x{size[1]}; meta/info.json says {width}x{height}: correct its shape"
+        )
     image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     if image is None:
-        raise EpisodeError(f"{meta.repo_id} episode {index}, {key}: an image of {len(content)} bytes cannot be decoded")
+        raise EpisodeError(f"{where}: an image of {len(content)} bytes cannot be decoded")
     return image
 
 
+def picture_channels(meta: LeRobotDatasetMetadata, key: str) -> int:
+    """How many channels a picture feature has: 1, 3 or 4."""
+    return picture_size(meta.features[key])[2]
+
+
 def encode_image(image: np.ndarray, suffix: str) -> bytes:
-    """An image file's content: colours uint8 [h,w,3], or depth [h,w] as it is stored."""
-    ok, content = cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image)
+    """An image file's content: colours uint8 [h,w,3] or [h,w,4], or grey or depth [h,w] as it is stored."""
+    if image.ndim == 3:
+        image = cv2.cvtColor(image, cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA)
+    ok, content = cv2.imencode(suffix, image)
     if not ok:
         raise EpisodeError(f"an image of shape {image.shape} cannot be encoded as {suffix}")
     return bytes(content.tobytes())
@@ -351,8 +392,3 @@ def _matrix(rows: pa.Table, key: str) -> Float[Tensor, "t n"] | None:
         return None
     values = np.stack([np.atleast_1d(np.asarray(item, np.float32)) for item in rows[key].to_pylist()])
     return torch.from_numpy(values)
-
-
-def _first_line(error: BaseException) -> str:
-    text = str(error).strip()
-    return f"{type(error).__name__}: {text.splitlines()[0]}" if text else type(error).__name__

@@ -33,6 +33,7 @@ from lerobot_msdyn.shared import (
     few_frames,
 )
 from lerobot_msdyn.sharing import NEAR, Backgrounds, moving_in_few, share, windows
+from lerobot_msdyn.staging import SCENE
 from lerobot_msdyn.unexplained import unexplained
 from lerobot_msdyn.views import Picture, Reconstruction, UnseenMasks, new_pictures
 from lerobot_msdyn.write import NewEpisode, OutputDataset
@@ -58,15 +59,19 @@ def augment_episode(
 ) -> list[NewEpisode]:
     """All new episodes of one source episode, staged in the output; `backgrounds` come from `shared_backgrounds`.
 
+    What an earlier run has finished of it is taken from the output's work folder.
+
     Raises:
         EpisodeError: the episode cannot be read.
         PriorError: a prior was demanded and cannot be had.
     """
     episode = read_episode(source, index, cameras, recipe.camera, recorded_depth=recipe.priors.depth != "plane")
+    kept = output.episode(index)
     scenes = {}
     for key, view in episode.views.items():
         progress(f"episode {index}: fitting {key}", 0.0)
-        scenes[key] = reconstruct(
+        make_scene = functools.partial(
+            reconstruct,
             view,
             recipe,
             lambda share: progress("", 0.5 * share / len(cameras)),
@@ -75,6 +80,7 @@ def augment_episode(
             episode=index,
             key=key,
         )
+        scenes[key] = kept.keep(f"{SCENE}_{key}", make_scene)
     priors = {key: scene.provenance for key, scene in scenes.items()}
     other = _other_pose(recipe, index, episode.views[cameras[0]])
     new = []
@@ -82,17 +88,35 @@ def augment_episode(
         new.append(NewEpisode(index, Provenance(source.repo_id, index, SOURCE_VARIANT, recipe.seed, {}, priors)))
     for variant in range(recipe.variants):
         progress(f"episode {index}: rendering variant {variant}", 0.0)
-        found, gate = _accepted(scenes, recipe, index, variant, other)
-        new.append(_staged(source, index, variant, recipe, output, scenes, found, gate))
+        make_episode = functools.partial(_rendered, source, index, variant, recipe, output, scenes, other)
+        new.append(kept.keep(f"variant_{variant:02d}", make_episode))
         progress("", 0.5 / recipe.variants)
     return new
+
+
+def _rendered(
+    source: LeRobotDatasetMetadata,
+    index: int,
+    variant: int,
+    recipe: Recipe,
+    output: OutputDataset,
+    scenes: Mapping[str, Reconstruction],
+    other: Tensor | None,
+) -> NewEpisode:
+    """One new episode, rendered and encoded; nothing is rendered of one that was dropped."""
+    start = time.perf_counter()
+    found, gate = _accepted(scenes, recipe, index, variant, other)
+    seconds = {"judging": round(time.perf_counter() - start, 1)}
+    seconds |= {f"fitting {key}": round(scene.seconds, 1) for key, scene in scenes.items()}
+    dropped = gate["rejected"][-1] if len(gate["rejected"]) > recipe.gate.redraws else ""
+    new = _staged(source, index, variant, recipe, output, scenes, found, gate, dropped=dropped)
+    return replace(new, seconds=seconds)
 
 
 def _accepted(
     scenes: Mapping[str, Reconstruction], recipe: Recipe, index: int, variant: int, other: Tensor | None
 ) -> tuple[NewCameras, dict[str, Any]]:
     """The cameras of one new episode, drawn again where they are rejected, and the gate's record."""
-    start = time.perf_counter()
     rejected: list[str] = []
     for attempt in range(recipe.gate.redraws + 1):
         found = new_cameras(scenes, recipe, index, variant, attempt, other)
@@ -107,13 +131,7 @@ def _accepted(
             break
         rejected.append("; ".join(why))
         logger.warning("episode %d variant %d, draw %d: rejected: %s", index, variant, attempt, rejected[-1])
-    return found, {
-        "views": views,
-        "rejected": rejected,
-        "dropped": rejected[-1] if len(rejected) > recipe.gate.redraws else "",
-        "fit_seconds": {key: round(scene.seconds, 1) for key, scene in scenes.items()},
-        "gate_seconds": round(time.perf_counter() - start, 1),
-    }
+    return found, {"views": views, "rejected": rejected}
 
 
 def _staged(
@@ -125,8 +143,9 @@ def _staged(
     scenes: Mapping[str, Reconstruction],
     found: NewCameras,
     gate: dict[str, Any],
+    *,
+    dropped: str,
 ) -> NewEpisode:
-    """One new episode, rendered and encoded; nothing is rendered of one that was dropped."""
     provenance = Provenance(
         source.repo_id,
         index,
@@ -137,13 +156,14 @@ def _staged(
         {key: camera_pose(scene.camera, found.cameras[key]) for key, scene in scenes.items()},
         gate,
     )
-    if gate["dropped"]:
-        return NewEpisode(index, provenance, dropped=gate["dropped"])
+    if dropped:
+        return NewEpisode(index, provenance, dropped=dropped)
     pictures = {key: new_pictures(scene, found.cameras[key], fill=recipe.fill) for key, scene in scenes.items()}
     masks = UnseenMasks() if recipe.masks else None
     if masks is not None:
         pictures = {key: masks.kept(key, some) for key, some in pictures.items()}
-    new = output.stage(index, variant, by_feature(source, pictures), provenance)
+    frames = by_feature(source, pictures, depth=recipe.render_depth)
+    new = output.stage(index, variant, frames, provenance)
     return new if masks is None else replace(new, masks=masks.arrays())
 
 
@@ -267,14 +287,14 @@ def _for_rough_depth(scene: SceneConfig) -> SceneConfig:
 
 
 def by_feature(
-    source: LeRobotDatasetMetadata, pictures: dict[str, Iterator[Picture]]
+    source: LeRobotDatasetMetadata, pictures: dict[str, Iterator[Picture]], *, depth: bool = True
 ) -> Iterator[dict[str, np.ndarray]]:
-    """Per time, feature -> picture: the cameras in step, and the depth of those that have a depth feature."""
+    """Per time, feature -> picture: the cameras in step, and the depth (if wanted) of those that have it recorded."""
     for together in zip(*pictures.values(), strict=True):
         features: dict[str, np.ndarray] = {}
         for key, picture in zip(pictures, together, strict=True):
             features[key] = picture.rgb
-            depth_key = depth_key_of(source, key)
+            depth_key = depth_key_of(source, key) if depth else None
             if depth_key is not None:
                 features[depth_key] = picture.depth
         yield features

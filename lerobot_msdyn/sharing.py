@@ -46,10 +46,11 @@ def shared_backgrounds(source: LeRobotDatasetMetadata, cameras: list[str], recip
 
     Episodes that cannot be read are left out here, and reported when it is their turn.
     """
-    if not recipe.scene.shared_background or source.total_episodes < 2:
+    episodes = background_episodes(source, recipe)
+    if not episodes:
         return {}
     views: dict[str, dict[int, View]] = {key: {} for key in cameras}  # by episode
-    for index in looked_at(source.total_episodes):
+    for index in episodes:
         with contextlib.suppress(EpisodeError):
             episode = read_episode(source, index, cameras, recipe.camera, recorded_depth=recipe.priors.depth != "plane")
             for key, view in episode.views.items():
@@ -69,6 +70,13 @@ def shared_backgrounds(source: LeRobotDatasetMetadata, cameras: list[str], recip
         with torch_on_one_thread():
             found[key] = share(list(some.values()), moving, recipe)
     return found
+
+
+def background_episodes(source: LeRobotDatasetMetadata, recipe: Recipe) -> list[int]:
+    """The episodes that `shared_backgrounds` looks at."""
+    if not recipe.scene.shared_background or source.total_episodes < 2:
+        return []
+    return looked_at(source.total_episodes)
 
 
 def looked_at(episodes: int) -> list[int]:

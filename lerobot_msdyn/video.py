@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 
@@ -12,14 +13,23 @@ from lerobot.datasets.depth_utils import quantize_depth
 from lerobot.datasets.pyav_utils import write_u16_plane
 from lerobot.datasets.video_utils import decode_video_frames, get_video_duration_in_s
 
-from lerobot_msdyn.episode import TIMESTAMP_TOLERANCE_S, VIDEO_BACKEND
+from lerobot_msdyn.episode import VIDEO_BACKEND, VIDEO_ERRORS
 from lerobot_msdyn.errors import EpisodeError, OutputError
+from lerobot_msdyn.files import DISK_FAULTS
+from lerobot_msdyn.rows import TIMESTAMP_TOLERANCE_S
+
+MAX_LEVEL_ERROR = 16  # of 255; coding changes a frame's mean brightness by less than 2, an empty frame by more
 
 
 def quiet_encoders() -> None:
-    """FFmpeg and the AV1 encoder write to stderr past every logger: let them write errors only."""
-    av.logging.set_libav_level(av.logging.ERROR)
+    """FFmpeg and the AV1 encoder write to stderr past every logger; what goes wrong is raised as well."""
+    av.logging.set_libav_level(av.logging.FATAL)
     os.environ.setdefault("SVT_LOG", "1")
+
+
+def frame_rate(fps: int | float) -> Fraction:
+    """A rate as video files hold it, e.g. 30000/1001."""
+    return Fraction(fps).limit_denominator(1001)
 
 
 def encoder_of(feature: dict, key: str) -> RGBEncoderConfig | DepthEncoderConfig:
@@ -32,17 +42,17 @@ def encoder_of(feature: dict, key: str) -> RGBEncoderConfig | DepthEncoderConfig
     kind = DepthEncoderConfig if info.get("is_depth_map") or info.get("video.is_depth_map") else RGBEncoderConfig
     try:
         return kind.from_video_info(info)
-    except ValueError as error:
+    except (ValueError, TypeError) as error:
         raise OutputError(f"{key}: cannot encode video as its source ({error})") from error
 
 
 class VideoFile:
     """An mp4 file that grows frame by frame, encoded as the source was."""
 
-    def __init__(self, path: Path, fps: int, encoder: RGBEncoderConfig | DepthEncoderConfig) -> None:
+    def __init__(self, path: Path, fps: int | float, encoder: RGBEncoderConfig | DepthEncoderConfig) -> None:
         quiet_encoders()
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._fps, self._encoder = fps, encoder
+        self._rate, self._encoder = frame_rate(fps), encoder
         self._container = av.open(str(path), "w")
         self._stream: av.VideoStream | None = None
         self._count = 0
@@ -61,11 +71,11 @@ class VideoFile:
             frame = _depth_frame(picture, self._encoder)
         if self._stream is None:
             options = self._encoder.get_codec_options(as_strings=True)
-            self._stream = self._container.add_stream(self._encoder.vcodec, self._fps, options=options)
+            self._stream = self._container.add_stream(self._encoder.vcodec, self._rate, options=options)
             self._stream.pix_fmt = self._encoder.pix_fmt
             self._stream.width, self._stream.height = frame.width, frame.height
         frame.pts = self._count
-        frame.time_base = Fraction(1, self._fps)
+        frame.time_base = 1 / self._rate
         self._container.mux(self._stream.encode(frame))
         self._count += 1
 
@@ -94,22 +104,33 @@ def _depth_frame(depth: np.ndarray, encoder: RGBEncoderConfig | DepthEncoderConf
 
 
 def cut_video(
-    source: Path, start_s: float, frames: int, fps: int, encoder: RGBEncoderConfig | DepthEncoderConfig, path: Path
+    source: Path,
+    start_s: float,
+    frames: int,
+    fps: int | float,
+    encoder: RGBEncoderConfig | DepthEncoderConfig,
+    path: Path,
 ) -> None:
     """Copy one episode out of a video file: packet by packet where it starts with a key frame, else encoded anew.
 
     Raises:
         EpisodeError: the file does not hold these frames.
+        OSError: the disk to write to is full.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
+        with av.open(str(source)) as container:
+            if container.streams.video[0].codec_context is None:  # copying such a stream would crash PyAV
+                raise ValueError("unknown codec")
         if start_s == 0 and abs(get_video_duration_in_s(source) * fps - frames) < 0.5:
             shutil.copyfile(source, path)
         else:
             _copy_packets(source, start_s, frames, fps, path)
-        if frame_times(path) != [Fraction(i, fps) for i in range(frames)]:
+        if frame_times(path) != [i / frame_rate(fps) for i in range(frames)]:
             _encode_anew(source, start_s, frames, fps, encoder, path)
-    except (OSError, ValueError, RuntimeError) as error:
+    except VIDEO_ERRORS as error:
+        if isinstance(error, OSError) and error.errno in DISK_FAULTS:
+            raise
         raise EpisodeError(f"{source}: no {frames} frames from {start_s:.3f} s on ({type(error).__name__})") from error
 
 
@@ -122,7 +143,39 @@ def frame_times(path: Path) -> list[Fraction]:
     return sorted(Fraction(round(time * rate * 1000), 1000) / rate for time in times)
 
 
-def _copy_packets(source: Path, start_s: float, frames: int, fps: int, path: Path) -> None:
+def problem_of(
+    path: Path, frames: int, fps: int | float, size: tuple[int, int], levels: Sequence[float] | None = None
+) -> str | None:
+    """What is wrong with a video, found by decoding it all; None if nothing is.
+
+    Args:
+        path: the file.
+        frames: how many it should have, the i-th at i / fps seconds within LeRobot's tolerance.
+        fps: frames per second.
+        size: width and height, px.
+        levels: the mean brightness (0 to 255) that each frame was given.
+    """
+    count = 0
+    try:
+        with av.open(str(path)) as container:
+            for frame in container.decode(video=0):
+                if frame.pts is None or abs(float(frame.pts * frame.time_base) - count / fps) > TIMESTAMP_TOLERANCE_S:
+                    return f"frame {count} is not at {count / fps:.4f} s"
+                if (frame.width, frame.height) != size:
+                    return f"frame {count} is {frame.width}x{frame.height}; expected {size[0]}x{size[1]}"
+                if frame.is_corrupt:
+                    return f"frame {count} is damaged"
+                if levels is not None and count < frames:
+                    level = float(frame.to_ndarray(format="rgb24").mean())
+                    if abs(level - levels[count]) > MAX_LEVEL_ERROR:
+                        return f"frame {count} has brightness {level:.0f}; {levels[count]:.0f} was drawn"
+                count += 1
+    except VIDEO_ERRORS as error:
+        return f"it cannot be decoded after {count} frames ({type(error).__name__})"
+    return None if count == frames else f"it has {count} frames; expected {frames}"
+
+
+def _copy_packets(source: Path, start_s: float, frames: int, fps: int | float, path: Path) -> None:
     half = 0.5 / fps
     with av.open(str(source)) as reader, av.open(str(path), "w", options={"movflags": "faststart"}) as writer:
         stream = reader.streams.video[0]
@@ -144,7 +197,12 @@ def _copy_packets(source: Path, start_s: float, frames: int, fps: int, path: Pat
 
 
 def _encode_anew(
-    source: Path, start_s: float, frames: int, fps: int, encoder: RGBEncoderConfig | DepthEncoderConfig, path: Path
+    source: Path,
+    start_s: float,
+    frames: int,
+    fps: int | float,
+    encoder: RGBEncoderConfig | DepthEncoderConfig,
+    path: Path,
 ) -> None:
     is_depth = isinstance(encoder, DepthEncoderConfig)
     times = [start_s + i / fps for i in range(frames)]

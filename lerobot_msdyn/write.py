@@ -1,15 +1,12 @@
 """Write a new LeRobot dataset: the source's rows bit for bit, its other cameras copied, new pictures encoded alike.
 
-Everything is prepared in a hidden folder beside the output, which appears by one rename when it is complete:
-
-    .<output>.partial/
-      staged/episode_000003_variant_00/<camera>.mp4    one new episode's pictures
-      dataset/                                         the dataset as it is put together
+Everything is prepared in a hidden folder beside the output (see `staging`), which appears by one rename when it is
+complete.
 """
 
 import copy
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,20 +15,21 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from lerobot.datasets import LeRobotDatasetMetadata
-from lerobot.datasets.compute_stats import (
-    auto_downsample_height_width,
-    compute_episode_stats,
-    sample_indices,
-)
+from lerobot.datasets.compute_stats import compute_episode_stats
 from lerobot.datasets.io_utils import write_info, write_tasks
 from lerobot.datasets.utils import update_chunk_file_indices
 from lerobot.datasets.video_utils import concatenate_video_files, get_video_duration_in_s
 
-from lerobot_msdyn.episode import depth_units_per_metre, inside_root, read_colour, read_depth, read_rows
+from lerobot_msdyn.card import licence_of, write_card
+from lerobot_msdyn.checks import PICTURE_DTYPES, TEXT_DTYPES
+from lerobot_msdyn.copies import stage_copies
 from lerobot_msdyn.errors import OutputError
+from lerobot_msdyn.files import temporary_files_in, writing
+from lerobot_msdyn.pictures import StagedPictures, Stats, stage_pictures
 from lerobot_msdyn.provenance import Provenance, write_provenance, write_unseen
-from lerobot_msdyn.staging import StagedPictures, Stats, image_stats, stage_pictures
-from lerobot_msdyn.video import cut_video, encoder_of
+from lerobot_msdyn.rows import TIMESTAMP_TOLERANCE_S, read_rows, values_of
+from lerobot_msdyn.staging import FINISHED, SCENE, Kept, Staging
+from lerobot_msdyn.video import frame_times
 
 MEGABYTE = 1024**2
 
@@ -45,69 +43,124 @@ class NewEpisode:
     pictures: StagedPictures = field(default_factory=StagedPictures)  # none for a copy of the source's episode
     masks: Mapping[str, np.ndarray] = field(default_factory=dict)  # of what was never seen, see `write_unseen`
     dropped: str = ""  # why there is no such episode in the end: the gate's reason
+    seconds: Mapping[str, float] = field(default_factory=dict)  # what took how long, for the report
 
 
 class OutputDataset:
-    """A dataset in the making. Use as a context: leaving it by an error removes what was prepared."""
+    """A dataset in the making. Use as a context; what is finished is kept for the next run, until the dataset is."""
 
-    def __init__(self, source: LeRobotDatasetMetadata, repo_id: str, root: Path) -> None:
+    def __init__(
+        self, source: LeRobotDatasetMetadata, repo_id: str, root: Path, staging: Staging | None = None
+    ) -> None:
         """Prepare the work folder.
 
+        Args:
+            source: the dataset whose episodes are re-rendered.
+            repo_id: the new dataset's name.
+            root: its place.
+            staging: a work folder that may hold what an earlier run finished; default: an empty one.
+
         Raises:
-            OutputError: the place is taken, lies inside the source, or cannot be written.
+            OutputError: the place is taken, lies inside the source, is being written by another run, or cannot be.
         """
-        check_place(source, root)
+        check_place(source.root, root)
         self.source, self.repo_id, self.root = source, repo_id, root
-        self._partial = root.with_name(f".{root.name}.partial")
-        try:
-            shutil.rmtree(self._partial, ignore_errors=True)
-            (self._partial / "staged").mkdir(parents=True)
-        except OSError as error:
-            raise OutputError(
-                f"{self._partial} cannot be written ({error.strerror}); choose another --new_root"
-            ) from error
+        self._resumable = staging is not None
+        self.staging = staging or Staging(root)
+        if staging is None:
+            self.staging.clear()
 
     def __enter__(self) -> "OutputDataset":
         return self
 
     def __exit__(self, *_: object) -> None:
-        shutil.rmtree(self._partial, ignore_errors=True)
+        if not self._resumable:
+            self.staging.remove()
+        self.staging.close()
+
+    def episode(self, index: int) -> Kept:
+        """What is kept of one source episode: `keep` computes a value once, whatever number of runs it takes."""
+        return self.staging.episode(index)
 
     def stage(
         self, index: int, variant: int, frames: Iterable[Mapping[str, np.ndarray]], provenance: Provenance
     ) -> NewEpisode:
         """Encode the new pictures of one episode as they are drawn (see `stage_pictures`)."""
-        folder = self._partial / "staged" / f"episode_{index:06d}_variant_{variant:02d}"
+        folder = self.episode(index).folder / f"variant_{variant:02d}"
         pictures = stage_pictures(self.source, folder, frames, int(self.source.episodes[index]["length"]))
         return NewEpisode(index, provenance, pictures)
 
-    def finish(self, episodes: list[NewEpisode], recipe_yaml: str) -> None:
-        """Put the dataset together and move it to its place.
+    def finish_episode(self, index: int, make: Callable[[], list[NewEpisode]]) -> list[NewEpisode]:
+        """All new episodes of one source episode, made once; what the source has to offer is copied and checked first.
+
+        Raises:
+            EpisodeError: a file of the episode is absent or damaged.
+            OutputError: the disk is full.
+        """
+        kept = self.episode(index)
+
+        def complete() -> list[NewEpisode]:
+            self.copies(index)
+            return make()
+
+        new: list[NewEpisode] = kept.keep(FINISHED, complete)
+        kept.forget(SCENE)
+        return new
+
+    def copies(self, index: int) -> StagedPictures:
+        """The source's pictures of one episode, cut out and checked."""
+        kept = self.episode(index)
+
+        def make() -> StagedPictures:
+            with writing(kept.folder):
+                return stage_copies(self.source, index, self.source.camera_keys, kept.folder / "copied")
+
+        found: StagedPictures = kept.keep("copied", make)
+        return found
+
+    def finish(
+        self,
+        episodes: list[NewEpisode],
+        recipe_yaml: str,
+        skipped: Sequence[str] = (),
+        report: Callable[[Path], object] = lambda folder: None,
+    ) -> None:
+        """Put the dataset together, read it again, and move it to its place.
+
+        Args:
+            episodes: what it consists of, in order.
+            recipe_yaml: the settings that it was made with.
+            skipped: one line per source or new episode that is not in it.
+            report: called with the folder of the complete dataset, before it is moved.
 
         Raises:
             EpisodeError: a file of the source cannot be copied.
-            OutputError: the place was taken meanwhile.
+            OutputError: the place was taken meanwhile, the disk is full, or what was written cannot be read.
         """
-        folder = self._partial / "dataset"
-        _Assembly(self.source, self.repo_id, folder).build(episodes)
-        write_provenance(folder, [episode.provenance for episode in episodes], recipe_yaml)
-        for number, episode in enumerate(episodes):
-            if episode.masks:
-                write_unseen(folder, number, episode.masks)
-        if self.root.exists():
-            raise OutputError(f"{self.root} appeared while the dataset was made; it was left as it is")
-        folder.rename(self.root)
+        folder = self.staging.folder / "dataset"
+        with writing(folder), temporary_files_in(self.staging.folder):
+            shutil.rmtree(folder, ignore_errors=True)
+            _Assembly(self.source, self.repo_id, folder, self.copies).build(episodes)
+            write_provenance(folder, [episode.provenance for episode in episodes], recipe_yaml)
+            for number, episode in enumerate(episodes):
+                if episode.masks:
+                    write_unseen(folder, number, episode.masks)
+            write_card(folder, self.repo_id, licence_of(self.source.root))
+            report(folder)
+            if self.root.exists():
+                raise OutputError(f"{self.root} appeared while the dataset was made; it was left as it is")
+            self.staging.publish(folder, self.root, skipped)
 
 
-def check_place(source: LeRobotDatasetMetadata, root: Path) -> None:
+def check_place(source_root: Path, root: Path) -> None:
     """Whether a dataset can be written to `root`.
 
     Raises:
         OutputError: it exists already, or lies inside the source.
     """
-    if root.resolve().is_relative_to(source.root.resolve()):
+    if root.resolve().is_relative_to(source_root.resolve()):
         raise OutputError(
-            f"{root} lies inside the source {source.root}, which is never written to; choose another --new_root"
+            f"{root} lies inside the source {source_root}, which is never written to; choose another --new_root"
         )
     if root.exists():
         raise OutputError(f"{root} exists already; remove it or choose another --new_repo_id or --new_root")
@@ -160,8 +213,15 @@ class _RowFiles:
 class _Assembly:
     """Builds the folder of a dataset from staged episodes."""
 
-    def __init__(self, source: LeRobotDatasetMetadata, repo_id: str, folder: Path) -> None:
+    def __init__(
+        self,
+        source: LeRobotDatasetMetadata,
+        repo_id: str,
+        folder: Path,
+        copies: Callable[[int], StagedPictures],
+    ) -> None:
         self.source = source
+        self.copies = copies
         self.folder = folder
         self.meta = LeRobotDatasetMetadata.create(
             repo_id=repo_id,
@@ -196,7 +256,8 @@ class _Assembly:
             for i, episode in enumerate(episodes):
                 if (key in episode.pictures.videos) != rendered:
                     continue
-                path = episode.pictures.videos[key] if rendered else self._copied_video(key, episode.source_index)
+                pictures = episode.pictures if rendered else self.copies(episode.source_index)
+                path = pictures.videos[key]
                 if group and size + path.stat().st_size > self.meta.video_files_size_in_mb * MEGABYTE:
                     self._write_video_file(key, group, files.take(), places)
                     group, size = [], 0
@@ -204,20 +265,6 @@ class _Assembly:
                 size += path.stat().st_size
             if group:
                 self._write_video_file(key, group, files.take(), places)
-
-    def _copied_video(self, key: str, index: int) -> Path:
-        path = self.folder.parent / "copied" / f"episode_{index:06d}" / f"{key}.mp4"
-        if not path.exists():
-            episode = self.source.episodes[index]
-            cut_video(
-                inside_root(self.source, self.source.get_video_file_path(index, key)),
-                float(episode[f"videos/{key}/from_timestamp"]),
-                int(episode["length"]),
-                self.source.fps,
-                encoder_of(self.source.features[key], key),
-                path,
-            )
-        return path
 
     def _write_video_file(
         self, key: str, group: list[tuple[int, Path]], place: tuple[int, int], places: list[dict[str, Any]]
@@ -239,17 +286,15 @@ class _Assembly:
                 f"videos/{key}/to_timestamp": end,
             }
             start = end
+        _check_times(path, sum(len(frame_times(part)) for _, part in group), self.meta.fps)
 
     def _place_rows(self, episodes: list[NewEpisode], places: list[dict[str, Any]]) -> None:
         start = 0
-        copied_stats: dict[int, Stats] = {}
         with _RowFiles(self.meta, self.folder) as files:
             for i, episode in enumerate(episodes):
                 rows = self._new_rows(episode, i, start)
                 chunk, file = files.add(rows)
-                if episode.source_index not in copied_stats:
-                    copied_stats = {episode.source_index: self._copied_stats(episode.source_index)}
-                stats = copied_stats[episode.source_index] | self._row_stats(rows) | episode.pictures.stats
+                stats = self.copies(episode.source_index).stats | self._row_stats(rows) | episode.pictures.stats
                 self.meta.save_episode(
                     i,
                     rows.num_rows,
@@ -277,24 +322,30 @@ class _Assembly:
 
     def _row_stats(self, rows: pa.Table) -> Stats:
         """Statistics of the numeric columns, computed as LeRobot does when it records."""
-        columns = {}
-        for key, feature in self.source.features.items():
-            if feature["dtype"] in ("video", "image", "string", "language") or key not in rows.column_names:
-                continue
-            columns[key] = np.stack([np.asarray(item) for item in rows[key].to_pylist()]).astype(feature["dtype"])
-        return compute_episode_stats(columns, self.source.features)
-
-    def _copied_stats(self, index: int) -> Stats:
-        """Statistics of the source's own pictures, from sampled frames."""
-        rows = read_rows(self.source, index)
-        chosen = sample_indices(rows.num_rows)
-        stats = {}
-        for key in self.source.camera_keys:
-            if key in self.source.depth_keys:
-                depth, _ = read_depth(self.source, index, key, rows)
-                samples, scale = depth[chosen][:, None].numpy() * depth_units_per_metre(self.source, key), 1.0
-            else:
-                samples = read_colour(self.source, index, key, rows)[chosen].permute(0, 3, 1, 2).numpy()
-                scale = 255.0
-            stats[key] = image_stats(np.stack([auto_downsample_height_width(sample) for sample in samples]), scale)
+        columns = {
+            key: values_of(rows, key, feature)
+            for key, feature in self.source.features.items()
+            if feature["dtype"] not in PICTURE_DTYPES + TEXT_DTYPES
+        }
+        # LeRobot's are per last axis where there are several, except for a single row: made alike, so that they add up.
+        nested = [key for key, values in columns.items() if values.ndim > 2]
+        columns |= {key: columns[key].reshape(-1, columns[key].shape[-1]) for key in nested}
+        stats: Stats = compute_episode_stats(columns, self.source.features)
+        for key in nested:
+            stats[key]["count"] = np.array([rows.num_rows])
         return stats
+
+
+def _check_times(path: Path, frames: int, fps: int | float) -> None:
+    """Whether the frames of a file that was put together follow each other evenly.
+
+    Raises:
+        OutputError: they do not.
+    """
+    times = frame_times(path)
+    late = max((abs(float(time) - i / fps) for i, time in enumerate(times)), default=0.0)
+    if len(times) != frames or late > TIMESTAMP_TOLERANCE_S:
+        raise OutputError(
+            f"{path} holds {len(times)} frames, up to {late:.4f} s from their times; expected {frames} within "
+            f"{TIMESTAMP_TOLERANCE_S} s"
+        )

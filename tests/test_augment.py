@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
@@ -114,7 +115,7 @@ def test_bad_input_is_one_line_and_exit_code_2(desk: Path, tmp_path: Path, capsy
         ([], "which dataset?"),
         (["--repo", "local/absent", "--root", str(tmp_path / "absent")], "no dataset in"),
         (["--repo", "local/absent"], "no dataset 'local/absent'"),
-        (["--repo", "local/desk", "--root", str(old)], "convert_dataset_v21_to_v30"),
+        (["--repo", "local/desk", "--root", str(old)], "add --convert"),
         ([*source, "--cameras", "[top]"], "no colour camera 'top'; it has"),
         ([*source, "--episodes", "[7]"], "no episode 7; it has 3 (0 to 2)"),
         ([*source, "--new_root", str(tmp_path / "there")], "exists already"),
@@ -182,6 +183,69 @@ def test_a_fault_in_one_episode_does_not_cost_the_others(
     assert run(*arguments, "--episodes", "[0,1]", "--cameras", "[front]", "--variants", "1", *FAST) == 1
     assert "skipped: local/desk episode 0: RuntimeError: a fault" in capsys.readouterr().out
     assert LeRobotDataset("local/desk_msdyn", root=tmp_path / "new", video_backend="pyav").num_episodes == 2
+
+
+def content(root: Path) -> dict[Path, bytes]:
+    """All files of a folder."""
+    return {path.relative_to(root): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+
+
+def test_a_run_that_was_stopped_goes_on_and_gives_the_same_files(
+    desk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from lerobot_msdyn import engines
+
+    whole = engines.augment_episode
+    begun = []
+
+    def stopped(source: object, index: int, *rest: object) -> object:
+        if index == 2 and begun:
+            raise KeyboardInterrupt
+        begun.append(index)
+        return whole(source, index, *rest)
+
+    arguments = ["--repo", "local/desk", "--root", str(desk), "--episodes", "[0,2]", "--cameras", "[front]"]
+    arguments += ["--variants", "1", *FAST, "--new_repo_id", "local/new"]
+    monkeypatch.setattr(engines, "augment_episode", stopped)
+    assert run(*arguments, "--new_root", str(tmp_path / "new")) == 130
+    assert "interrupted: 1 episodes are finished and kept in" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+    assert run(*arguments, "--new_root", str(tmp_path / "new"), "--fit.steps", "9") == 2
+    assert "started differently: fit.steps was 8, is 9. Start it as before" in capsys.readouterr().err
+    monkeypatch.setattr(engines, "augment_episode", whole)
+    assert run(*arguments, "--new_root", str(tmp_path / "new")) == 0
+    assert run(*arguments, "--new_root", str(tmp_path / "whole")) == 0
+    first, second = (
+        {
+            path.relative_to(tmp_path / name): path.read_bytes()
+            for path in (tmp_path / name).rglob("*")
+            if path.is_file()
+        }
+        for name in ("new", "whole")
+    )
+    assert first == second
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["new", "whole"]
+    assert begun == [0]
+
+
+def test_states_that_are_no_numbers_cost_their_episode_only(
+    desk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = tmp_path / "nan"
+    shutil.copytree(desk, root)
+    path = next((root / "data").rglob("*.parquet"))
+    table = pq.read_table(path)
+    states = table["observation.state"].to_pylist()
+    states[12][3] = float("nan")
+    field = table.schema.field("observation.state")
+    position = table.column_names.index(field.name)
+    pq.write_table(table.set_column(position, field, pa.array(states, field.type)), path)
+    arguments = ["--repo", "local/desk", "--root", str(root), "--new_root", str(tmp_path / "new")]
+    assert run(*arguments, "--episodes", "[0,1]", "--cameras", "[front]", "--variants", "1", *FAST) == 1
+    said = capsys.readouterr().out
+    assert "1 of 2 episodes, 1 new ones" in said
+    assert "skipped: local/desk episode 1: in" in said
+    assert "observation.state is not a number in 1 of 12 rows" in said
 
 
 def test_as_a_module() -> None:

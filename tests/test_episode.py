@@ -82,7 +82,7 @@ def copy_with_info(desk: Path, tmp_path: Path, **changes: object) -> Path:
     return root
 
 
-@pytest.mark.parametrize(("version", "hint"), [("v2.1", "convert_dataset_v21_to_v30"), ("v2.0", "v2.1 with an older")])
+@pytest.mark.parametrize(("version", "hint"), [("v2.1", "--convert"), ("v2.0", "v2.1 with an older")])
 def test_an_old_version_names_the_converter(desk: Path, tmp_path: Path, version: str, hint: str) -> None:
     with pytest.raises(DatasetError, match=f"version {version}; expected v3.0.*{hint}"):
         open_source("local/desk", copy_with_info(desk, tmp_path, codebase_version=version))
@@ -90,7 +90,14 @@ def test_an_old_version_names_the_converter(desk: Path, tmp_path: Path, version:
 
 def test_paths_that_leave_the_dataset_are_refused(desk: Path, tmp_path: Path) -> None:
     root = copy_with_info(desk, tmp_path, data_path="../../secret-{chunk_index}-{file_index}.parquet")
-    with pytest.raises(DatasetError, match="outside of"):
+    with pytest.raises(DatasetError, match="leaves the dataset's folder"):
+        open_source("local/desk", root)
+    shutil.rmtree(root)
+    root = copy_with_info(desk, tmp_path)
+    data = next((root / "data").rglob("*.parquet"))
+    data.rename(tmp_path / "secret.parquet")
+    data.symlink_to(tmp_path / "secret.parquet")
+    with pytest.raises(EpisodeError, match="outside of"):
         read_episode(open_source("local/desk", root), 0, [FRONT], CameraConfig())
 
 

@@ -1,15 +1,17 @@
 """From a video to its scenes and new pictures, also where the video is not as one would wish."""
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 from lerobot_msdyn import pipeline
 from lerobot_msdyn.config import Recipe
-from lerobot_msdyn.episode import View
-from lerobot_msdyn.pipeline import new_pictures, reconstruct
+from lerobot_msdyn.episode import View, open_source
+from lerobot_msdyn.pipeline import Picture, by_feature, new_pictures, reconstruct
 from lerobot_msdyn.priors import Priors, estimate_priors
 from lerobot_msdyn.synthetic import make_scene
 
@@ -133,3 +135,10 @@ def test_a_long_video_is_fitted_in_windows(pushed: View) -> None:
     whole = list(new_pictures(found, pushed.camera))
     for picture, frame in zip(new_pictures(found, pushed.camera.select(frames), frames), frames, strict=True):
         assert abs(picture.rgb.astype(int) - whole[int(frame)].rgb).max() <= 1
+
+
+def test_depth_is_rendered_where_it_is_recorded_and_wanted(desk: Path) -> None:
+    source, key = open_source("local/desk", desk), "observation.images.front"
+    picture = Picture(np.zeros((HEIGHT, WIDTH, 3), np.uint8), np.ones((HEIGHT, WIDTH), np.float32))
+    for depth, features in ((True, [key, f"{key}_depth"]), (False, [key])):
+        assert [list(found) for found in by_feature(source, {key: iter([picture])}, depth=depth)] == [features]

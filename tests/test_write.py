@@ -10,8 +10,8 @@ from lerobot.datasets import LeRobotDataset
 
 from lerobot_msdyn.episode import open_source, read_colour, read_depth, read_rows
 from lerobot_msdyn.errors import OutputError
+from lerobot_msdyn.pictures import image_stats
 from lerobot_msdyn.provenance import SOURCE_VARIANT, Provenance
-from lerobot_msdyn.staging import image_stats
 from lerobot_msdyn.write import NewEpisode, OutputDataset
 
 FRONT = "observation.images.front"
@@ -161,6 +161,6 @@ def test_an_error_leaves_nothing_behind(desk: Path, tmp_path: Path) -> None:
         with OutputDataset(source, "local/new", tmp_path / "new") as output:
             output.stage(0, 0, [{FRONT: np.zeros((48, 64, 3), np.uint8)}], copied(0).provenance)
 
-    with pytest.raises(OutputError, match="episode_000000_variant_00: 1 frames were drawn; expected 12"):
+    with pytest.raises(OutputError, match="episodes/000000/variant_00: 1 frames were drawn; expected 12"):
         write()
     assert list(tmp_path.iterdir()) == []

@@ -32,7 +32,9 @@ PALETTE = np.array(
 )
 
 
-def contact_sheet(videos: Sequence[tuple[str, View, Priors]], fps: int, columns: int) -> UInt8[ndarray, "_ _ 3"]:
+def contact_sheet(
+    videos: Sequence[tuple[str, View, Priors]], fps: int | float, columns: int
+) -> UInt8[ndarray, "_ _ 3"]:
     """Per camera (name, video, priors) four rows, over evenly spread frames: picture, instances, depth, tracks."""
     blocks = [_block(name, view, priors, fps, columns) for name, view, priors in videos]
     width = max(block.shape[1] for block in blocks)
@@ -43,7 +45,7 @@ def contact_sheet(videos: Sequence[tuple[str, View, Priors]], fps: int, columns:
     return np.concatenate(padded)
 
 
-def _block(name: str, view: View, priors: Priors, fps: int, columns: int) -> UInt8[ndarray, "_ _ 3"]:
+def _block(name: str, view: View, priors: Priors, fps: int | float, columns: int) -> UInt8[ndarray, "_ _ 3"]:
     frames = np.unique(np.linspace(0, len(view.rgb) - 1, columns).round().astype(int)).tolist()
     rgb = view.rgb.numpy()
     near, far = depth_range(priors)

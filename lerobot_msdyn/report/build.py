@@ -35,6 +35,7 @@ PICTURED = 16  # views with pictures
 def write_report(
     source: LeRobotDatasetMetadata,
     root: Path,
+    name: str,
     episodes: Sequence[NewEpisode],
     skipped: Sequence[str],
     seconds: float,
@@ -44,6 +45,7 @@ def write_report(
     Args:
         source: the dataset whose episodes were re-rendered.
         root: folder of the new dataset.
+        name: its name in the page.
         episodes: all of a run in order, the dropped ones among them.
         skipped: why source episodes were left out, one line each.
         seconds: what the run took.
@@ -54,7 +56,7 @@ def write_report(
         entry = entries[i]
         entries[i] = replace(entry, pictures=_pictures(source, output, places[i], entry))
     path = root / NAME
-    path.write_text(page(root.name, _figures(episodes, entries, skipped, seconds), entries, skipped), encoding="utf-8")
+    path.write_text(page(name, _figures(episodes, entries, skipped, seconds), entries, skipped), encoding="utf-8")
     return path
 
 
@@ -111,7 +113,7 @@ def _figures(
     scores = [entry.score for entry in entries if not entry.dropped and np.isfinite(entry.score)]
     fitting: dict[tuple[int, str], float] = {}
     for episode in made:
-        fitting |= {(episode.source_index, key): s for key, s in episode.provenance.gate["fit_seconds"].items()}
+        fitting |= {(episode.source_index, key): s for key, s in episode.seconds.items() if key.startswith("fitting ")}
     return {
         "new episodes": str(sum(not episode.dropped for episode in made)),
         "dropped by the gate": str(sum(bool(episode.dropped) for episode in made)),
@@ -120,7 +122,7 @@ def _figures(
         "expected quality, median": f"{np.median(scores):.1f} dB" if scores else "not judged",
         "all in all": _time(seconds),
         "in fitting": _time(sum(fitting.values())),
-        "in judging": _time(sum(episode.provenance.gate["gate_seconds"] for episode in made)),
+        "in judging": _time(sum(episode.seconds["judging"] for episode in made)),
     }
 
 

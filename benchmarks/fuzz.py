@@ -1,0 +1,284 @@
+"""Run the command on datasets that are broken in random ways, and see that it always ends well.
+
+python benchmarks/fuzz.py [--count 2000] [--seed 0] [--out FOLDER]
+
+Every run must end by itself within a minute with exit code 0, 1 or 2, show no traceback, leave the source and
+everything beside the output as they were, and leave an output that LeRobot opens, or none. Rendering is replaced by
+turning the recorded pictures upside down, but for every 50th run: what is tried is reading and writing.
+"""
+
+# ruff: noqa: E402 (the environment is set before LeRobot reads it)
+
+import argparse
+import collections
+import contextlib
+import io
+import json
+import logging
+import os
+import random
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("HF_HUB_OFFLINE", "1")
+SCRATCH = Path(tempfile.mkdtemp(prefix="msdyn_fuzz_"))
+os.environ["HF_HOME"] = str(SCRATCH / "hf")
+os.environ["LEROBOT_MSDYN_CACHE"] = str(SCRATCH / "cache")
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from lerobot.datasets import LeRobotDataset
+
+from lerobot_msdyn import augment, engines
+from lerobot_msdyn.cli import run_command
+from lerobot_msdyn.episode import read_episode
+from lerobot_msdyn.provenance import Provenance
+from lerobot_msdyn.synthetic import make_scene
+from lerobot_msdyn.synthetic.dataset import write_dataset
+from lerobot_msdyn.write import NewEpisode
+
+LIMIT_S = 60
+WHOLE_EVERY = 50
+FRAMES, WIDTH, HEIGHT = 4, 32, 24
+FLAGS = ["--cameras=[front]", "--variants=1", "--fit.steps=1", "--fit.max_width=16", "--scene.moving_gaussians=50"]
+NASTY: list[Any] = [
+    None, True, False, 0, -1, 1, 3, 0.5, -0.0, 1e308, 1e-300, float("nan"), float("inf"), 10**12, 2**63, 10**30,
+    "", " ", "..", "../../..", "/etc/passwd", "a/b", "\x00", "\u202e", "x" * 5000, "{", "}", "{}", "{0}", "{a}", "%s",
+    "v2.1", "v9.9", "video", "image", "float32", "object", "O", "U9", "int64", "language", [], [1], [[]], [0, 0, 0],
+    [-1, 2, 3], [24, 32, 3], [10**9, 10**9, 3], [3, 24, 32], {}, {"a": 1},
+    {"video.extra_options": {"x265-params": "csv=/tmp/x"}},
+    "../{video_key}/{chunk_index}-{file_index}.mp4", "/tmp/{chunk_index}-{file_index}", "{chunk_index.__class__}",
+    "{chunk_index!r}", "{chunk_index:999999999d}", "{video_key:>999999999}", "{episode_index}", "data/{chunk_index}",
+]  # fmt: skip
+
+
+def fake_episode(source: Any, index: int, cameras: list[str], recipe: Any, output: Any, *_: Any) -> list[NewEpisode]:
+    """The recorded pictures upside down, staged as rendered ones would be."""
+    episode = read_episode(source, index, cameras, recipe.camera)
+    views = {key: view.rgb.flip(1).numpy() for key, view in episode.views.items()}
+    frames = [{key: rgb[t] for key, rgb in views.items()} for t in range(len(episode))]
+    new = output.stage(index, 0, iter(frames), Provenance(source.repo_id, index, 0, 0))
+    return [NewEpisode(index, Provenance(source.repo_id, index, -1, 0)), new]
+
+
+def spots(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """All places in nested JSON."""
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, item in items:
+        yield (*path, key)
+        yield from spots(item, (*path, key))
+
+
+def mutate_json(path: Path, rng: random.Random) -> str:
+    content = json.loads(path.read_text())
+    *parents, last = rng.choice(list(spots(content)))
+    target = content
+    for key in parents:
+        target = target[key]
+    if rng.random() < 0.2:
+        if isinstance(target, dict):
+            del target[last]
+        what = "removed"
+    else:
+        target[last] = rng.choice(NASTY)
+        what = repr(target[last])[:40]
+    path.write_text(json.dumps(content))
+    return f"{'.'.join(map(str, (*parents, last)))} {what}"
+
+
+def mutate_table(path: Path, rng: random.Random) -> str:
+    table = pq.read_table(path)
+    name = rng.choice(
+        [column for column in table.column_names if not column.startswith("stats/")] or table.column_names
+    )
+    position = table.column_names.index(name)
+    kind = rng.choice(["cell", "drop", "text", "null", "rename", "rows", "shuffle", "cell", "cell"])
+    if kind == "drop":
+        table = table.drop_columns([name])
+    elif kind == "rename":
+        table = table.rename_columns([f"{c}x" if c == name else c for c in table.column_names])
+    elif kind == "rows":
+        table = table.slice(0, rng.randrange(table.num_rows + 1))
+    elif kind == "shuffle":
+        table = table.take(pa.array(rng.choices(range(table.num_rows), k=table.num_rows)))
+    else:
+        values = table[name].to_pylist()
+        row = rng.randrange(len(values))
+        if kind == "text":
+            column = pa.array([str(value) for value in values])
+        elif kind == "null":
+            column = pa.nulls(len(values))
+        else:
+            value = values[row]
+            if isinstance(value, list) and value and rng.random() < 0.7:
+                value[rng.randrange(len(value))] = float("nan")
+            elif isinstance(value, list):
+                values[row] = value[:-1] if rng.random() < 0.5 else None
+            else:
+                values[row] = rng.choice([None, 0, -1, 1, 5, 10**6, 10**12, float("nan"), float("inf"), 0.01, "x"])
+            try:
+                column = pa.array(values)
+            except (pa.ArrowException, OverflowError, TypeError):
+                column = pa.array([str(value) for value in values])
+        table = table.set_column(position, name, column)
+    pq.write_table(table, path)
+    return f"{name} {kind}"
+
+
+def mutate_bytes(path: Path, rng: random.Random) -> str:
+    content = bytearray(path.read_bytes())
+    kind = rng.choice(["cut", "empty", "flip", "flip", "noise", "text", "doubled"])
+    if kind == "cut":
+        content = content[: rng.randrange(len(content) + 1)]
+    elif kind == "empty":
+        content = bytearray()
+    elif kind == "flip":
+        for _ in range(rng.choice([1, 3, 30])):
+            content[rng.randrange(len(content))] = rng.randrange(256)
+    elif kind == "noise":
+        content = bytearray(rng.randbytes(len(content)))
+    elif kind == "text":
+        content = bytearray(b'{"what": "this is not"}')
+    else:
+        content = content + content
+    path.write_bytes(bytes(content))
+    return f"bytes {kind}"
+
+
+def mutate_file(path: Path, rng: random.Random) -> str:
+    outside = path.parents[len(path.parents) - 1] / "etc" / "hostname"
+    kind = rng.choice(["gone", "folder", "link out", "link nowhere", "link loop", "pipe", "device", "other"])
+    other = rng.choice([file for file in sorted(path.parent.parent.rglob("*")) if file.is_file()])
+    if kind == "other":
+        shutil.copyfile(other, path) if other != path else None
+        return kind
+    path.unlink()
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "link out":
+        path.symlink_to(outside)
+    elif kind == "link nowhere":
+        path.symlink_to("nowhere")
+    elif kind == "link loop":
+        path.symlink_to(path.name)
+    elif kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    return kind
+
+
+def mutate(root: Path, rng: random.Random) -> str:
+    """Break something; returns what."""
+    files = [path for path in sorted(root.rglob("*")) if path.is_file()]
+    weights = [6 if path.name == "info.json" else 3 if "episodes" in path.parts else 1 for path in files]
+    path = rng.choices(files, weights)[0]
+    ways: list[Callable[[Path, random.Random], str]] = [mutate_bytes, mutate_file]
+    if path.suffix == ".json":
+        ways = [mutate_json] * 8 + ways
+    if path.suffix == ".parquet":
+        ways = [mutate_table] * 6 + ways
+    return f"{path.relative_to(root)}: {rng.choice(ways)(path, rng)}"
+
+
+def listing(root: Path) -> dict[str, tuple[Any, ...]]:
+    """Everything in a folder, down to sizes and times."""
+    return {
+        str(path.relative_to(root)): (path.lstat().st_mode, path.lstat().st_size, path.lstat().st_mtime_ns)
+        for path in sorted(root.rglob("*"))
+    }
+
+
+def trial(original: Path, place: Path, rng: random.Random, *, whole: bool) -> tuple[str, int | None, list[str], str]:
+    """One broken dataset; what was broken, the exit code, what went wrong, and what was said."""
+    shutil.rmtree(place, ignore_errors=True)
+    source, out = place / "ds", place / "out"
+    shutil.copytree(original, source)
+    broken = []
+    for _ in range(rng.choice([1, 1, 1, 2, 3])):
+        with contextlib.suppress(OSError, ValueError, KeyError, IndexError, TypeError, pa.ArrowException):
+            broken.append(mutate(source, rng))  # the second may find the file unusable that the first broke
+    before, here = listing(source), set(listing(Path.cwd()))
+    said, code, faults = io.StringIO(), None, []
+    engines.augment_episode = REAL if whole else fake_episode
+    logging.basicConfig(level=logging.INFO, stream=said, force=True)
+    signal.alarm(LIMIT_S)
+    try:
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            run_command(augment.run, ["--repo=local/ds", f"--root={source}", f"--new_root={out}", *FLAGS])
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else None
+    except BaseException as error:
+        faults.append(f"{type(error).__name__} {error}")
+    finally:
+        signal.alarm(0)
+    text = said.getvalue()
+    if code not in (0, 1, 2):
+        faults.append(f"exit code {code}")
+    if "Traceback" in text or "please report" in text:
+        faults.append("traceback")
+    if listing(source) != before:
+        faults.append("the source was touched")
+    if code == 2 and text.count("error: ") != 1:
+        faults.append("not one line")
+    there = {path.name for path in place.iterdir()}
+    if there - {"ds"} != ({"out"} if code in (0, 1) else set()):
+        faults.append(f"left behind: {sorted(there)}")
+    if set(listing(Path.cwd())) != here:
+        faults.append("a stray file")
+    if code in (0, 1):
+        try:
+            dataset = LeRobotDataset("local/out", root=out, video_backend="pyav")
+            assert len(dataset[i]) > 0 if (i := len(dataset) - 1) else True
+        except Exception as error:
+            faults.append(f"the output cannot be opened: {type(error).__name__} {error}")
+    return "; ".join(broken), code, faults, text
+
+
+def main() -> int:
+    """Print a summary; 0 if nothing went wrong."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=2000)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+
+    def late(*_: Any) -> None:
+        raise TimeoutError(f"more than {LIMIT_S} s")
+
+    signal.signal(signal.SIGALRM, late)
+    work = SCRATCH / "work"
+    work.mkdir()
+    os.chdir(work)
+    scenes = [make_scene("push", 0, FRAMES, WIDTH, HEIGHT, episode=index) for index in range(3)]
+    for name, dtype in (("video", "video"), ("image", "image")):
+        write_dataset(scenes, "local/ds", SCRATCH / name, cameras=["front", "side"], depth=True, image_dtype=dtype)
+    codes: collections.Counter[int | None] = collections.Counter()
+    bad = 0
+    begin = time.perf_counter()
+    for number in range(options.count):
+        rng = random.Random(options.seed * 1_000_003 + number)
+        original = SCRATCH / ("image" if number % 4 == 3 else "video")
+        broken, code, faults, text = trial(original, SCRATCH / "place", rng, whole=number % WHOLE_EVERY == 0)
+        codes[code] += 1
+        if faults:
+            bad += 1
+            print(f"{number}: {broken}: {'; '.join(faults)}\n{text[-1500:]}\n", flush=True)
+        if number % 100 == 99:
+            shutil.rmtree(SCRATCH / "hf", ignore_errors=True)
+            print(f"{number + 1}: {dict(codes)}, {bad} bad, {time.perf_counter() - begin:.0f} s", flush=True)
+    print(f"{options.count} broken datasets: exit codes {dict(codes)}; {bad} ended badly")
+    os.chdir("/")
+    shutil.rmtree(SCRATCH, ignore_errors=True)
+    return int(bad > 0)
+
+
+REAL = engines.augment_episode
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,96 @@
+"""Command line: give a dataset that LeRobot's tools made of others its meta/msdyn/, which they leave behind.
+
+python -m lerobot_msdyn.carry --root MERGED --sources '[FOLDER, FOLDER]'
+"""
+
+import logging
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lerobot_msdyn.cli import EXIT_OK, parse_config, run_command
+from lerobot_msdyn.config import CarryConfig
+from lerobot_msdyn.errors import ConfigError, DatasetError
+
+if TYPE_CHECKING:
+    from lerobot.datasets import LeRobotDatasetMetadata
+
+logger = logging.getLogger(__name__)
+
+COMMAND = "python -m lerobot_msdyn.carry"
+
+Mark = tuple[str | None, str]  # digests of an episode's rows and of the statistics of its pictures
+
+
+def carry_provenance(root: Path, sources: list[Path]) -> int:
+    """Write meta/msdyn/ of a dataset whose episodes come from others; returns how many there are.
+
+    Episodes are recognised by their rows and by the statistics of their pictures. Those of a dataset without
+    meta/msdyn/ are recordings of their own.
+
+    Raises:
+        DatasetError: an episode is in none of the sources, or in several that say different things about it.
+    """
+    from lerobot_msdyn.card import write_card
+    from lerobot_msdyn.episode import open_source
+    from lerobot_msdyn.provenance import write_rows
+
+    known: dict[Mark, list[dict[str, Any]]] = {}
+    origin: dict[str | None, dict[str, Any]] = {}
+    for source in sources:
+        for mark, row in _known_episodes(source):
+            known.setdefault(mark, []).append(row)
+            if row.get("recipe_sha256"):
+                origin[mark[0]] = {name: row[name] for name in ("source_repo_id", "source_episode")}
+    meta = open_source(root.name, root)
+    rows = []
+    for index, mark in enumerate(_marks(meta)):
+        found = [row | origin.get(mark[0], {}) for row in known.get(mark, [])]
+        found = [row for row in found if row.get("recipe_sha256")] or found
+        if len({(row["source_repo_id"], row["source_episode"], row["variant"]) for row in found}) != 1:
+            said = "several of the sources, which disagree about it" if found else "none of the sources"
+            raise DatasetError(f"{root}: episode {index} is in {said}: {', '.join(map(str, sources))}")
+        rows.append(found[0])
+    names = sorted({name for row in rows for name in row} - {"episode_index"})
+    write_rows(root, [{name: row.get(name) for name in names} for row in rows])
+    write_card(root, meta.repo_id)
+    return len(rows)
+
+
+def _known_episodes(root: Path) -> list[tuple[Mark, dict[str, Any]]]:
+    """By what an episode is recognised, and what is known about it."""
+    from lerobot_msdyn.episode import open_source
+    from lerobot_msdyn.lineage import provenance_of
+    from lerobot_msdyn.provenance import SOURCE_VARIANT
+
+    meta = open_source(root.name, root)
+    rows = provenance_of(meta) or [
+        {"source_repo_id": meta.repo_id, "source_episode": index, "variant": SOURCE_VARIANT}
+        for index in range(meta.total_episodes)
+    ]
+    return list(zip(_marks(meta), rows, strict=True))
+
+
+def _marks(meta: "LeRobotDatasetMetadata") -> list[Mark]:
+    from lerobot_msdyn.lineage import picture_digests, row_digests
+
+    return list(zip(row_digests(meta), picture_digests(meta), strict=True))
+
+
+def run(arguments: list[str]) -> int:
+    """Write meta/msdyn/ and say so; returns the exit code."""
+    config = parse_config(CarryConfig, arguments, {}, command=COMMAND)
+    if config.root is None or not config.sources:
+        raise ConfigError(f"which datasets? {COMMAND} --root FOLDER --sources '[FOLDER, ...]' (see --help)")
+    count = carry_provenance(config.root, config.sources)
+    sys.stdout.write(f"meta/msdyn/ of {count} episodes written to {config.root}\n")
+    return EXIT_OK
+
+
+def main() -> None:
+    """Entry point."""
+    run_command(run)
+
+
+if __name__ == "__main__":
+    main()
