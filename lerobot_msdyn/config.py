@@ -206,6 +206,8 @@ class Recipe:
     variants: int = 2
     # Whether the source episodes are copied into the output as well.
     include_source: bool = True
+    # Whether the reconstructed scenes are kept in the output, for training on views of them (docs/scenes.md).
+    save_scenes: bool = False
     # Seed of every random choice; together with the episode and the variant it fixes the result.
     seed: int = 0
     # auto, cpu or cuda.

@@ -13,6 +13,7 @@ from jaxtyping import Float32, UInt8
 from lerobot.datasets import LeRobotDatasetMetadata
 from torch import Tensor
 
+from lerobot_msdyn import saved
 from lerobot_msdyn.background import empty_scene
 from lerobot_msdyn.cameras import CameraTrack, concatenated
 from lerobot_msdyn.config import Recipe, SceneConfig
@@ -25,6 +26,7 @@ from lerobot_msdyn.priors import PointTracks, Priors, estimate_priors
 from lerobot_msdyn.provenance import SOURCE_VARIANT, Provenance
 from lerobot_msdyn.quality import HOLE_ALPHA, fill_holes
 from lerobot_msdyn.rendering import render_frames
+from lerobot_msdyn.saved import SavedScene, SceneSource
 from lerobot_msdyn.shared import (
     MAX_EPISODES,
     SharedBackground,
@@ -155,7 +157,18 @@ def augment_episode(
         provenance = Provenance(source.repo_id, index, variant, recipe.seed, drawn, priors)
         new.append(output.stage(index, variant, by_feature(source, pictures), provenance))
         progress("", 0.5 / recipe.variants)
+    if recipe.save_scenes:
+        for key, scene in scenes.items():
+            saved.save(to_saved(scene, SceneSource(source.repo_id, index, key, source.fps)), output.scenes)
     return new
+
+
+def to_saved(scene: Reconstruction, source: SceneSource) -> SavedScene:
+    """What of a reconstruction is kept."""
+    windows = tuple(result.scene for result in scene.results)
+    return SavedScene(
+        source, windows, scene.starts, scene.camera, scene.metric, scene.distance, scene.provenance
+    )
 
 
 def reconstruct(

@@ -4,6 +4,7 @@ Everything is prepared in a hidden folder beside the output, which appears by on
 
     .<output>.partial/
       staged/episode_000003_variant_00/<camera>.mp4    one new episode's pictures
+      scenes/episode_000003/<camera>/                  saved scenes, where they are asked for
       dataset/                                         the dataset as it is put together
 """
 
@@ -27,6 +28,7 @@ from lerobot.datasets.io_utils import write_info, write_tasks
 from lerobot.datasets.utils import update_chunk_file_indices
 from lerobot.datasets.video_utils import concatenate_video_files, get_video_duration_in_s
 
+from lerobot_msdyn import saved
 from lerobot_msdyn.episode import depth_units_per_metre, inside_root, read_colour, read_depth, read_rows
 from lerobot_msdyn.errors import OutputError
 from lerobot_msdyn.provenance import Provenance, write_provenance
@@ -57,6 +59,7 @@ class OutputDataset:
         check_place(source, root)
         self.source, self.repo_id, self.root = source, repo_id, root
         self._partial = root.with_name(f".{root.name}.partial")
+        self.scenes = self._partial / "scenes"
         try:
             shutil.rmtree(self._partial, ignore_errors=True)
             (self._partial / "staged").mkdir(parents=True)
@@ -89,6 +92,8 @@ class OutputDataset:
         folder = self._partial / "dataset"
         _Assembly(self.source, self.repo_id, folder).build(episodes)
         write_provenance(folder, [episode.provenance for episode in episodes], recipe_yaml)
+        if self.scenes.is_dir():
+            self.scenes.rename(folder / saved.FOLDER)
         if self.root.exists():
             raise OutputError(f"{self.root} appeared while the dataset was made; it was left as it is")
         folder.rename(self.root)
