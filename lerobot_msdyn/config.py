@@ -272,6 +272,22 @@ class EvaluateConfig(Recipe):
     depth: str = "recorded"
 
 
+@dataclass
+class MixedViewsConfig:
+    """`lerobot_msdyn.training`: which samples are seen from elsewhere while a policy is trained (docs/training.md)."""
+
+    # Output folder of `augment --save_scenes true`.
+    scenes: Path = Path()
+    # Share of the samples that are seen from elsewhere.
+    probability: float = 0.5
+    # A recipe, by file or name, whose perturbation is drawn; default: the one of the run that saved the scenes.
+    perturbation: str | None = None
+    # Seed of every random choice; together with the epoch and the sample's index it fixes the result.
+    seed: int = 0
+    # Memory for the scenes that are kept loaded, in MB, in each data loading worker.
+    memory_mb: float = 1024.0
+
+
 def problems(config: object, prefix: str = "") -> list[str]:
     """One line per value that is out of range, over all nested fields; `config` is any of the classes here."""
     lines = []
@@ -349,6 +365,7 @@ _RANGES: dict[str, tuple[tuple[str, float, float], ...]] = {
         ("held_out_frames", 0, 1000),
         ("patience", 1, 1_000_000),
     ),
+    "MixedViewsConfig": (("probability", 0, 1), ("seed", 0, 2**32 - 1), ("memory_mb", 0, _ANY)),
     "OrbitConfig": (("azimuth_deg", 0, 90), ("elevation_deg", 0, 60), ("translation_rel", 0, 1)),
     "JitterConfig": (("translation_rel", 0, 1), ("rotation_deg", 0, 45)),
 }

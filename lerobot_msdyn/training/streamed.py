@@ -1,0 +1,75 @@
+"""A streaming LeRobot dataset, some of whose samples are seen from elsewhere."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from lerobot.datasets import StreamingLeRobotDataset
+
+from lerobot_msdyn.config import MixedViewsConfig, PerturbationConfig
+from lerobot_msdyn.training.cache import Scenes
+from lerobot_msdyn.training.mixer import ViewMixer, colour_sample, depth_sample
+
+
+class MixedStream(torch.utils.data.IterableDataset):
+    """As `MixedViews`, around a StreamingLeRobotDataset.
+
+    The scenes must be on this machine, and recorded frames that are replaced have been decoded already: nothing is
+    saved by streaming but the disk for the recording.
+    """
+
+    def __init__(
+        self,
+        dataset: StreamingLeRobotDataset,
+        scenes: str | os.PathLike[str] | Scenes,
+        probability: float = MixedViewsConfig.probability,
+        perturbation: PerturbationConfig | None = None,
+        seed: int = MixedViewsConfig.seed,
+        *,
+        memory_mb: float = MixedViewsConfig.memory_mb,
+    ) -> None:
+        """Arguments and errors as in `MixedViews`."""
+        self.dataset = dataset
+        folder = scenes if not isinstance(scenes, str | os.PathLike) else Path(scenes)
+        self.mixer = ViewMixer(
+            dataset.meta,
+            dataset.episodes,
+            dict(dataset.delta_indices or {}),
+            folder,
+            probability,
+            perturbation,
+            seed,
+            memory_mb,
+        )
+
+    def __getattr__(self, name: str) -> Any:
+        """All else is the wrapped dataset's."""
+        if name == "dataset":  # asked for while a copy is being unpickled
+            raise AttributeError(name)
+        return getattr(self.dataset, name)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Tell it, and workers that run already, which epoch it is."""
+        self.mixer.set_epoch(epoch)
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        for item in self.dataset:
+            yield self._mixed(item)
+
+    def _mixed(self, item: dict[str, Any]) -> dict[str, Any]:
+        """A sample, seen from elsewhere if its turn has come."""
+        episode, position = int(item["episode_index"]), int(item["frame_index"])
+        rng = self.mixer.rng(int(item["index"]))
+        pictures = self.mixer.draw(episode, position, self.mixer.replaced(episode, rng), rng)
+        transforms, meta = self.dataset.image_transforms, self.dataset.meta
+        for camera, found in pictures.items():
+            windowed = item[camera].ndim == 4
+            image = colour_sample(found, item[camera].dtype, windowed=windowed)
+            item[camera] = image if transforms is None else transforms(image)
+            depth_key = self.mixer.depth_keys[camera]
+            if depth_key is not None:
+                windowed, unit = item[depth_key].ndim == 4, self.dataset.depth_output_unit
+                item[depth_key] = depth_sample(found, meta, depth_key, unit, windowed=windowed)
+        return item
