@@ -85,8 +85,9 @@ class ViewMixer:
             live, depth_key = self.cache.get(episode, camera), self.depth_keys[camera]
             colour = [position + delta for delta in self.deltas.get(camera, [0])]
             depth = [] if depth_key is None else [position + delta for delta in self.deltas.get(depth_key, [0])]
-            wanted = torch.tensor(colour + depth).clamp(0, self._lengths[episode] - 1)
-            frames, places = wanted.unique(return_inverse=True)
+            within = np.clip(colour + depth, 0, self._lengths[episode] - 1)
+            wanted, places = np.unique(within, return_inverse=True)
+            frames = torch.from_numpy(wanted)
             drawn = live.draw(new_camera(self.perturbation, live.scene, frames, rng), frames)
             pictures[camera] = LivePictures(drawn.rgb[places[: len(colour)]], drawn.depth[places[len(colour) :]])
         return pictures
