@@ -273,6 +273,22 @@ class EvaluateConfig(Recipe):
 
 
 @dataclass
+class ViewerConfig(Recipe):
+    """`python -m lerobot_msdyn.viewer`: look at an episode, its scene and its new views in Rerun."""
+
+    # Source dataset (alias: --repo).
+    repo_id: str = ""
+    # Exact folder of the source dataset; default: LeRobot's home, then the hub.
+    root: Path | None = None
+    # The episode to show.
+    episode: int = 0
+    # Output folder of `augment --save_scenes true`; without it the episode is fitted first.
+    scenes: Path | None = None
+    # A .rrd file to write instead of opening a window.
+    save: Path | None = None
+
+
+@dataclass
 class MixedViewsConfig:
     """`lerobot_msdyn.training`: which samples are seen from elsewhere while a policy is trained (docs/training.md)."""
 
@@ -337,6 +353,7 @@ _RANGES: dict[str, tuple[tuple[str, float, float], ...]] = {
     "Recipe": _RECIPE_RANGES,
     "AugmentConfig": _RECIPE_RANGES,
     "EvaluateConfig": _RECIPE_RANGES,
+    "ViewerConfig": _RECIPE_RANGES,
     "PriorsCommandConfig": (*_RECIPE_RANGES, ("columns", 1, 100)),
     "CameraConfig": (("horizontal_fov_deg", 5, 170), ("height_m", 0.01, 100), ("tilt_deg", 1, 90)),
     "SceneConfig": (

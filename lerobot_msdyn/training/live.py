@@ -21,10 +21,11 @@ _SMALLEST_PX = 2  # the pyramid that fills holes ends where a side is so short
 
 @dataclass(frozen=True)
 class LivePictures:
-    """Some frames of a new view; colours and depth need not be of the same ones."""
+    """Some frames of a new view."""
 
     rgb: UInt8[np.ndarray, "t h w 3"]
-    depth: Float32[np.ndarray, "d h w"]  # m, z-depth; 0 where nothing is known, and everywhere if there is no true scale
+    depth: Float32[np.ndarray, "t h w"]  # m, z-depth; 0 where nothing is known, and everywhere if there is no true scale
+    alpha: Float32[np.ndarray, "t h w"]  # 0..1: below one half nothing is known
 
 
 class LiveScene:
@@ -45,14 +46,16 @@ class LiveScene:
         height, width = camera.height, camera.width
         rgb = np.empty((len(frames), height, width, 3), np.uint8)
         depth = np.zeros((len(frames), height, width), np.float32)
+        opacity = np.empty((len(frames), height, width), np.float32)
         windows = self.scene.windows_of(frames).tolist()
         for i, (number, frame) in enumerate(zip(windows, frames.tolist(), strict=True)):
             at = camera.select([i])
             seen, distance, alpha = self._windows[number].draw(at, frame - self.scene.starts[number])
+            opacity[i] = alpha
             rgb[i] = filled(seen, alpha >= HOLE_ALPHA)
             if self.scene.metric:
                 depth[i] = np.where(alpha >= HOLE_ALPHA, distance, np.float32(0))
-        return LivePictures(rgb, depth)
+        return LivePictures(rgb, depth, opacity)
 
 
 class _LiveWindow:

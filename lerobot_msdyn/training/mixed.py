@@ -11,7 +11,6 @@ from lerobot.datasets import LeRobotDataset
 
 from lerobot_msdyn.config import MixedViewsConfig, PerturbationConfig
 from lerobot_msdyn.training.cache import Scenes
-from lerobot_msdyn.training.live import LivePictures
 from lerobot_msdyn.training.mixer import ViewMixer, colour_sample, depth_sample
 
 
@@ -91,19 +90,18 @@ class MixedViews(torch.utils.data.Dataset):
 
 
 def with_pictures(
-    dataset: LeRobotDataset, index: int, pictures: dict[str, LivePictures], mixer: ViewMixer
+    dataset: LeRobotDataset, index: int, pictures: dict[str, np.ndarray], mixer: ViewMixer
 ) -> dict[str, Any]:
     """A dataset's sample with other pictures in it, transformed as the dataset's own are."""
     meta = dataset.meta
-    depth_keys = {mixer.depth_keys[camera]: camera for camera in pictures if mixer.depth_keys[camera] is not None}
-    item = _read(dataset, index, {*pictures, *depth_keys} & set(meta.video_keys))
+    item = _read(dataset, index, pictures.keys() & set(meta.video_keys))
     for key, found in pictures.items():
-        as_bytes = key in meta.video_keys and dataset._return_uint8
-        dtype = torch.uint8 if as_bytes else torch.float32
-        item[key] = colour_sample(found, dtype, windowed=_is_windowed(dataset, key, mixer))
-    for key, camera in depth_keys.items():
         windowed = _is_windowed(dataset, key, mixer)
-        item[key] = depth_sample(pictures[camera], meta, key, dataset.depth_output_unit, windowed=windowed)
+        if key in meta.depth_keys:
+            item[key] = depth_sample(found, meta, key, dataset.depth_output_unit, windowed=windowed)
+        else:
+            as_bytes = key in meta.video_keys and dataset._return_uint8
+            item[key] = colour_sample(found, torch.uint8 if as_bytes else torch.float32, windowed=windowed)
     if dataset.image_transforms is not None:
         for key in meta.camera_keys:
             if key not in meta.depth_keys:

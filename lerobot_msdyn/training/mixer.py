@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Int
+from jaxtyping import Float32, Int, UInt8
 from lerobot.configs import DepthEncoderConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from torch import Tensor
@@ -16,7 +16,6 @@ from lerobot_msdyn.errors import ConfigError
 from lerobot_msdyn.perturbation import draw_offset, perturb
 from lerobot_msdyn.saved import SavedScene
 from lerobot_msdyn.training.cache import SceneCache, Scenes
-from lerobot_msdyn.training.live import LivePictures
 from lerobot_msdyn.training.matching import perturbation_of, scenes_of
 
 _STREAM = 0x4D56  # keeps these random numbers apart from those of written episodes
@@ -71,8 +70,10 @@ class ViewMixer:
             return []
         return sorted(self.cache.scenes.get(episode, ()))
 
-    def draw(self, episode: int, position: int, cameras: list[str], rng: np.random.Generator) -> dict[str, LivePictures]:
-        """The observation windows of some cameras and of their depth (if recorded), each through one new pose.
+    def draw(self, episode: int, position: int, cameras: list[str], rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """The windows of some cameras and of their depth (if recorded), by feature; each through one new pose.
+
+        Colours are uint8 [t,h,w,3], depth float32 [t,h,w] in m.
 
         Args:
             episode: of the dataset.
@@ -80,7 +81,7 @@ class ViewMixer:
             cameras: from `replaced`.
             rng: from `rng`, after `replaced`.
         """
-        pictures = {}
+        pictures: dict[str, np.ndarray] = {}
         for camera in cameras:
             live, depth_key = self.cache.get(episode, camera), self.depth_keys[camera]
             colour = [position + delta for delta in self.deltas.get(camera, [0])]
@@ -89,7 +90,9 @@ class ViewMixer:
             wanted, places = np.unique(within, return_inverse=True)
             frames = torch.from_numpy(wanted)
             drawn = live.draw(new_camera(self.perturbation, live.scene, frames, rng), frames)
-            pictures[camera] = LivePictures(drawn.rgb[places[: len(colour)]], drawn.depth[places[len(colour) :]])
+            pictures[camera] = drawn.rgb[places[: len(colour)]]
+            if depth_key is not None:
+                pictures[depth_key] = drawn.depth[places[len(colour) :]]
         return pictures
 
 
@@ -101,18 +104,18 @@ def new_camera(
     return perturb(scene.camera.select(frames), offset)
 
 
-def colour_sample(pictures: LivePictures, dtype: torch.dtype, *, windowed: bool) -> Tensor:
+def colour_sample(rgb: UInt8[np.ndarray, "t h w 3"], dtype: torch.dtype, *, windowed: bool) -> Tensor:
     """Colours as a dataset returns them: uint8, or floats 0..1; [c,h,w], or [t,c,h,w] for a window."""
-    images = torch.from_numpy(pictures.rgb).permute(0, 3, 1, 2).contiguous()
+    images = torch.from_numpy(rgb).permute(0, 3, 1, 2).contiguous()
     images = images if dtype == torch.uint8 else images.to(dtype) / 255
     return images if windowed else images[0]
 
 
 def depth_sample(
-    pictures: LivePictures, meta: LeRobotDatasetMetadata, key: str, unit: str, *, windowed: bool
+    depth_m: Float32[np.ndarray, "t h w"], meta: LeRobotDatasetMetadata, key: str, unit: str, *, windowed: bool
 ) -> Tensor:
     """Depth as a dataset returns it, in mm or m; [1,h,w], or [t,1,h,w] for a window."""
-    depth = torch.from_numpy(pictures.depth)[:, None]
+    depth = torch.from_numpy(depth_m)[:, None]
     if key in meta.video_keys:  # which cannot say less than that, nor more
         encoder = DepthEncoderConfig.from_video_info(meta.features[key].get("info") or {})
         depth = depth.clamp(encoder.depth_min, encoder.depth_max)

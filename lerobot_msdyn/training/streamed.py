@@ -63,13 +63,12 @@ class MixedStream(torch.utils.data.IterableDataset):
         episode, position = int(item["episode_index"]), int(item["frame_index"])
         rng = self.mixer.rng(int(item["index"]))
         pictures = self.mixer.draw(episode, position, self.mixer.replaced(episode, rng), rng)
-        transforms, meta = self.dataset.image_transforms, self.dataset.meta
-        for camera, found in pictures.items():
-            windowed = item[camera].ndim == 4
-            image = colour_sample(found, item[camera].dtype, windowed=windowed)
-            item[camera] = image if transforms is None else transforms(image)
-            depth_key = self.mixer.depth_keys[camera]
-            if depth_key is not None:
-                windowed, unit = item[depth_key].ndim == 4, self.dataset.depth_output_unit
-                item[depth_key] = depth_sample(found, meta, depth_key, unit, windowed=windowed)
+        for key, found in pictures.items():
+            windowed = item[key].ndim == 4
+            if key in self.dataset.meta.depth_keys:
+                unit = self.dataset.depth_output_unit
+                item[key] = depth_sample(found, self.dataset.meta, key, unit, windowed=windowed)
+            else:
+                image, transforms = colour_sample(found, item[key].dtype, windowed=windowed), self.dataset.image_transforms
+                item[key] = image if transforms is None else transforms(image)
         return item
