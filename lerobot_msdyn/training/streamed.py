@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lerobot.datasets import StreamingLeRobotDataset
 
 from lerobot_msdyn.config import MixedViewsConfig, PerturbationConfig
 from lerobot_msdyn.training.cache import Scenes
@@ -22,7 +21,7 @@ class MixedStream(torch.utils.data.IterableDataset):
 
     def __init__(
         self,
-        dataset: StreamingLeRobotDataset,
+        dataset: Any,
         scenes: str | os.PathLike[str] | Scenes,
         probability: float = MixedViewsConfig.probability,
         perturbation: PerturbationConfig | None = None,
@@ -30,7 +29,7 @@ class MixedStream(torch.utils.data.IterableDataset):
         *,
         memory_mb: float = MixedViewsConfig.memory_mb,
     ) -> None:
-        """Arguments and errors as in `MixedViews`."""
+        """Arguments and errors as in `MixedViews`, but `dataset` is a StreamingLeRobotDataset."""
         self.dataset = dataset
         folder = scenes if not isinstance(scenes, str | os.PathLike) else Path(scenes)
         self.mixer = ViewMixer(
