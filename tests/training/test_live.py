@@ -51,6 +51,8 @@ def turning(scene: DynamicScene, bases: int = 3) -> DynamicScene:
 def with_field(scene: DynamicScene) -> DynamicScene:
     """The scene with a deformation field instead of bases."""
     means, count = scene.moving.means, len(scene.moving)
+    if count == 0:
+        return scene
     tracks = means[:20, None] + 0.1 * torch.arange(scene.frames)[None, :, None]
     field = fit_field(means[:20], tracks, torch.ones(20, scene.frames), steps=5)
     return replace(scene, levels=(field,), indices=(torch.zeros(count, 1).long(),), logits=(torch.zeros(count, 1),))

@@ -1,6 +1,7 @@
 """Mixed views: what changes in a sample, what does not, and what it depends on."""
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -95,6 +96,7 @@ def test_a_sample_depends_on_seed_epoch_and_index(desk: Path, desk_scenes: Path)
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")
 @pytest.mark.parametrize(("workers", "context"), [(1, "fork"), (2, "spawn"), (4, "fork")])
 def test_workers_change_nothing(desk: Path, desk_scenes: Path, workers: int, context: str) -> None:
     mixed = MixedViews(recorded(desk, episodes=[0, 1]), desk_scenes, 0.5)
@@ -155,14 +157,12 @@ def test_scenes_from_memory(desk: Path, desk_scenes: Path) -> None:
 
 def test_bad_input_is_named(desk: Path, image_desk: Path, desk_scenes: Path, tmp_path: Path) -> None:
     dataset = recorded(desk)
-    with pytest.raises(ConfigError, match="probability is 2; expected a value from 0 to 1"):
-        MixedViews(dataset, desk_scenes, 2)
+    with pytest.raises(ConfigError, match="probability is 2.0; expected a value from 0 to 1"):
+        MixedViews(dataset, desk_scenes, 2.0)
     with pytest.raises(MsdynError, match="no saved scenes"):
         MixedViews(dataset, tmp_path)
     scene = saved.load(saved.list_scenes(desk_scenes)[0][FRONT])
     with pytest.raises(DatasetError, match="no camera 'observation.images.top'"):
         MixedViews(dataset, {0: {"observation.images.top": scene}})
-    from dataclasses import replace
-
     with pytest.raises(DatasetError, match="the scene is of 6 frames of 64x48; expected 12 of 64x48"):
         MixedViews(dataset, {0: {FRONT: replace(scene, camera=scene.camera.select(slice(0, 6)))}})
