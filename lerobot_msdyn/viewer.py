@@ -201,7 +201,7 @@ def _log_new_view(log: _Log, config: ViewerConfig, scene: "SavedScene", variant:
     for frame in range(len(scene)):
         at = torch.tensor([frame])
         pictures = live.draw(camera.select([frame]), at)
-        log.at(frame, f"new_{variant}/rendered", rr.Image(pictures.rgb[0]).compress(jpeg_quality=90))
+        log.at(frame, f"new_{variant}/rendered", rr.Image(pictures.rgb[0].transpose(1, 2, 0)).compress(jpeg_quality=90))
         log.at(frame, f"new_{variant}/coverage", rr.Image((255 * pictures.alpha[0]).round().astype(np.uint8)))
 
 

@@ -16,6 +16,7 @@ from lerobot_msdyn.saved import SavedScene
 from lerobot_msdyn.scene import DynamicScene
 from lerobot_msdyn.training.posing import pose
 
+_COARSER = 4  # holes are filled at a quarter of the size
 _SMALLEST_PX = 2  # the pyramid that fills holes ends where a side is so short
 
 
@@ -23,7 +24,7 @@ _SMALLEST_PX = 2  # the pyramid that fills holes ends where a side is so short
 class LivePictures:
     """Some frames of a new view."""
 
-    rgb: UInt8[np.ndarray, "t h w 3"]
+    rgb: UInt8[np.ndarray, "t 3 h w"]
     depth: Float32[np.ndarray, "t h w"]  # m, z-depth; 0 where nothing is known, and everywhere if there is no true scale
     alpha: Float32[np.ndarray, "t h w"]  # 0..1: below one half nothing is known
 
@@ -44,7 +45,7 @@ class LiveScene:
     def draw(self, camera: CameraTrack, frames: Int[Tensor, " t"]) -> LivePictures:
         """The scene at some frames through as many poses, holes filled."""
         height, width = camera.height, camera.width
-        rgb = np.empty((len(frames), height, width, 3), np.uint8)
+        rgb = np.empty((len(frames), 3, height, width), np.uint8)
         depth = np.zeros((len(frames), height, width), np.float32)
         opacity = np.empty((len(frames), height, width), np.float32)
         windows = self.scene.windows_of(frames).tolist()
@@ -95,7 +96,7 @@ class _LiveWindow:
 
     @torch.no_grad()
     def draw(self, camera: CameraTrack, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Colours uint8 [h,w,3], depth (m) [h,w] and opacity [h,w] of one frame through a camera of one pose."""
+        """Colours uint8 [3,h,w], depth (m) [h,w] and opacity [h,w] of one frame through a camera of one pose."""
         time = torch.tensor([frame])
         eye = camera.world_from_camera[0, :3, 3]
         self._set_moving(time, eye)
@@ -114,7 +115,8 @@ class _LiveWindow:
             camera.width,
             camera.height,
         )
-        rgb = raster.features[0].clamp(0, 1).mul_(255).round_().to(torch.uint8)
+        planes = raster.features[0].permute(2, 0, 1)  # as they lie in memory
+        rgb = planes.clamp(0, 1).mul_(255).round_().to(torch.uint8)
         return rgb.numpy(), raster.depth[0].numpy(), raster.alpha[0].numpy()
 
     def _set_moving(self, time: Int[Tensor, " 1"], eye: Tensor) -> None:
@@ -150,20 +152,21 @@ def _is_idle(level: object) -> bool:
     return isinstance(level, MotionLevel) and not bool(level.active.any())
 
 
-def filled(rgb: UInt8[np.ndarray, "h w 3"], known: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+def filled(rgb: UInt8[np.ndarray, "3 h w"], known: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "3 h w"]:
     """A picture whose holes show what is around them, ever more coarsely (pull-push, Gortler et al. 1996).
 
     Softer than the inpainting of written episodes, and several times as fast.
     """
     if known.all() or not known.any():
         return rgb
+    mask = known.astype(np.uint8)
     height, width = known.shape
-    half = (max(width // 2, 1), max(height // 2, 1))
-    weighted = cv2.resize(np.where(known[..., None], rgb, np.uint8(0)), half, interpolation=cv2.INTER_AREA)
-    weight = cv2.resize(known.astype(np.float32), half, interpolation=cv2.INTER_AREA)
-    pulled = _pulled(weighted.astype(np.float32), weight).clip(0, 255).astype(np.uint8)
-    everywhere = cv2.resize(pulled, (width, height), interpolation=cv2.INTER_LINEAR)
-    return np.where(known[..., None], rgb, everywhere)
+    coarse = (max(width // _COARSER, 1), max(height // _COARSER, 1))
+    weighted = [cv2.resize(plane, coarse, interpolation=cv2.INTER_AREA) for plane in rgb * mask]
+    weight = cv2.resize(mask.astype(np.float32), coarse, interpolation=cv2.INTER_AREA)
+    pulled = _pulled(np.stack(weighted, axis=-1).astype(np.float32), weight).clip(0, 255).astype(np.uint8)
+    around = [cv2.resize(plane, (width, height), interpolation=cv2.INTER_LINEAR) for plane in pulled.transpose(2, 0, 1)]
+    return np.stack([cv2.copyTo(plane, mask, hidden) for plane, hidden in zip(rgb, around, strict=True)])
 
 
 def _pulled(weighted: Float32[np.ndarray, "h w 3"], weight: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w 3"]:

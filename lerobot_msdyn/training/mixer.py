@@ -73,7 +73,7 @@ class ViewMixer:
     def draw(self, episode: int, position: int, cameras: list[str], rng: np.random.Generator) -> dict[str, np.ndarray]:
         """The windows of some cameras and of their depth (if recorded), by feature; each through one new pose.
 
-        Colours are uint8 [t,h,w,3], depth float32 [t,h,w] in m.
+        Colours are uint8 [t,3,h,w], depth float32 [t,h,w] in m.
 
         Args:
             episode: of the dataset.
@@ -104,9 +104,9 @@ def new_camera(
     return perturb(scene.camera.select(frames), offset)
 
 
-def colour_sample(rgb: UInt8[np.ndarray, "t h w 3"], dtype: torch.dtype, *, windowed: bool) -> Tensor:
+def colour_sample(rgb: UInt8[np.ndarray, "t 3 h w"], dtype: torch.dtype, *, windowed: bool) -> Tensor:
     """Colours as a dataset returns them: uint8, or floats 0..1; [c,h,w], or [t,c,h,w] for a window."""
-    images = torch.from_numpy(rgb).permute(0, 3, 1, 2).contiguous()
+    images = torch.from_numpy(rgb)
     images = images if dtype == torch.uint8 else images.to(dtype) / 255
     return images if windowed else images[0]
 

@@ -71,8 +71,8 @@ def test_the_same_picture_as_the_renderer_draws(scene: SavedScene, change: objec
         with torch.no_grad():
             expected = draw(scene.windows[number], camera.select([i]), torch.tensor([frame - scene.starts[number]]))
         known = expected.alpha[0].numpy() >= 0.5
-        rgb = 255 * expected.rgb[0].clamp(0, 1).numpy()
-        assert np.abs(found.rgb[i].astype(float) - rgb)[known].max() < 1
+        rgb = 255 * expected.rgb[0].clamp(0, 1).permute(2, 0, 1).numpy()
+        assert np.abs(found.rgb[i].astype(float) - rgb)[:, known].max() < 1
         assert np.abs(found.depth[i] - expected.depth[0].numpy())[known].max() < 1e-4
         assert (found.depth[i][~known] == 0).all()
         np.testing.assert_allclose(found.alpha[i], expected.alpha[0].numpy(), atol=1e-4)
@@ -84,15 +84,15 @@ def test_depth_without_true_scale_is_unknown(scene: SavedScene) -> None:
 
 
 def test_holes_take_the_colour_around_them() -> None:
-    rgb = np.full((40, 60, 3), 100, np.uint8)
-    rgb[:, 30:] = 200
+    rgb = np.full((3, 40, 60), 100, np.uint8)
+    rgb[:, :, 30:] = 200
     known = np.ones((40, 60), bool)
     known[10:30, 5:15] = False
-    rgb[~known] = 0
+    rgb[:, ~known] = 0
     found = filled(rgb, known)
-    assert np.abs(found[~known].astype(int) - 100).max() < 15
-    assert (found[known] == rgb[known]).all()
+    assert np.abs(found[:, ~known].astype(int) - 100).max() < 15
+    assert (found[:, known] == rgb[:, known]).all()
     assert (filled(rgb, np.zeros_like(known)) == rgb).all(), "with nothing known nothing is invented"
     single = np.zeros_like(known)
     single[20, 30] = True
-    assert np.abs(filled(rgb, single)[~single].astype(int) - 200).max() < 5
+    assert np.abs(filled(rgb, single)[:, ~single].astype(int) - 200).max() < 5
