@@ -59,11 +59,11 @@ def timed(function: Callable, name: str, seconds: dict[str, float]) -> Callable:
 
 def measure(case: Case, recipe_name: str, steps: int | None, pipe: Connection) -> None:
     """Send the seconds of every stage and the peak of resident memory (MB)."""
-    from lerobot_msdyn import pipeline
+    from lerobot_msdyn import pipeline, views
+    from lerobot_msdyn.bounds import new_cameras
     from lerobot_msdyn.cli import parse_config
     from lerobot_msdyn.config import AugmentConfig
     from lerobot_msdyn.episode import open_source
-    from lerobot_msdyn.perturbation import draw_offset, draw_rng, perturb
     from lerobot_msdyn.render.warmup import warm_up
     from lerobot_msdyn.synthetic import make_scene
     from lerobot_msdyn.synthetic.dataset import write_dataset
@@ -83,7 +83,7 @@ def measure(case: Case, recipe_name: str, steps: int | None, pipe: Connection) -
         key = "observation.images.front"
         share = timed(pipeline.shared_backgrounds, "shared background", seconds)
         read = timed(pipeline.read_episode, "read", seconds)
-        render = timed(lambda scene, camera: list(pipeline.new_pictures(scene, camera)), "render", seconds)
+        render = timed(lambda scene, camera: list(views.new_pictures(scene, camera)), "render", seconds)
         backgrounds = share(source, [key], recipe)
         pipeline.estimate_priors = timed(pipeline.estimate_priors, "priors", seconds)
         pipeline.initialise = timed(pipeline.initialise, "initial scene", seconds)
@@ -92,8 +92,7 @@ def measure(case: Case, recipe_name: str, steps: int | None, pipe: Connection) -
             scene = pipeline.reconstruct(view, recipe, backgrounds=backgrounds.get(key, []))
             seconds["fit"] += scene.seconds
             for variant in range(case.variants):
-                offset, _ = draw_offset(recipe.perturbation, scene.distance, draw_rng(0, index, variant))
-                render(scene, perturb(scene.camera, offset))
+                render(scene, new_cameras({key: scene}, recipe, index, variant).cameras[key])
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
     pipe.send((dict(seconds), peak_mb))
 

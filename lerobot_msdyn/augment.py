@@ -32,11 +32,14 @@ def run(arguments: list[str]) -> int:
     # LeRobot and torch take seconds to import: only now, so that --help and bad flags are answered at once.
     from lerobot.utils.constants import HF_LEROBOT_HOME
 
+    from lerobot_msdyn.action_safety import still_cameras
     from lerobot_msdyn.episode import open_source, select_cameras, select_episodes
 
     source = open_source(config.repo_id, config.root)
     episodes = select_episodes(source, config.episodes)
-    cameras = select_cameras(source, config.cameras)
+    cameras = select_cameras(source, config.cameras, allow_moving=config.allow_moving)
+    if not config.allow_moving:
+        cameras = still_cameras(source, episodes[0], cameras, config)
     new_repo_id = config.new_repo_id or f"{config.repo_id}_msdyn"
     new_root = config.new_root
     if new_root is None and config.root is not None and config.new_repo_id is None:
@@ -65,7 +68,8 @@ def augment(
     with OutputDataset(source, new_repo_id, new_root) as output:
         new, failures = run_local(source, episodes, cameras, config, output)
         if not new:
-            raise EpisodeError(f"no episode could be augmented; nothing was written. First: {failures[0]}")
+            first = failures[0] if failures else "every new view was rejected, see above; allow more by --max_unseen"
+            raise EpisodeError(f"no episode could be augmented; nothing was written. First: {first}")
         output.finish(new, draccus.dump(config))
     rendered = sum(episode.provenance.variant != SOURCE_VARIANT for episode in new)
     sys.stdout.write(

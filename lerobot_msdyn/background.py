@@ -36,7 +36,7 @@ class EmptyScene:
 def empty_scene(
     rgb: UInt8[Tensor, "t h w 3"], depth: Float[Tensor, "t h w"], instances: UInt8[Tensor, "t h w"]
 ) -> EmptyScene:
-    """Median colour and depth of every pixel over frames in which nothing moves there or close by.
+    """Median colour and depth of every pixel over frames in which nothing moves there, nor close by if there are such.
 
     Args:
         rgb: the video.
@@ -44,19 +44,18 @@ def empty_scene(
         instances: what moves, 0 = nothing.
     """
     frames, height, width = instances.shape
-    window = np.ones((2 * MARGIN_PX + 1,) * 2, np.uint8)
-    still = np.stack([cv2.dilate((mask > 0).astype(np.uint8), window) == 0 for mask in instances.numpy()])
     colours, depths = rgb.numpy().reshape(frames, -1, 3), depth.numpy().reshape(frames, -1)
-    still = still.reshape(frames, -1)
-    sample = np.linspace(0, frames - 1, min(frames, SAMPLES)).round().astype(int)
-    values = np.concatenate((colours[sample], depths[sample, :, None]), axis=-1, dtype=np.float32)
-    seen = still[sample].sum(0)
-    rare = seen < min(FEW, len(sample))
-    median = _masked_median(values, still[sample])
-    if rare.any():
-        all_frames = np.concatenate((colours[:, rare], depths[:, rare, None]), axis=-1, dtype=np.float32)
-        median[rare] = _masked_median(all_frames, still[:, rare])
-        seen[rare] = still[:, rare].sum(0)
+    median = np.zeros((height * width, 4), np.float32)
+    seen = np.zeros(height * width, np.int64)
+    for margin in range(MARGIN_PX, -1, -1):  # closer to what moves only where nothing better shows a pixel
+        window = np.ones((2 * margin + 1,) * 2, np.uint8)
+        still = np.stack([cv2.dilate((mask > 0).astype(np.uint8), window) == 0 for mask in instances.numpy()])
+        still = still.reshape(frames, -1)
+        sample = np.linspace(0, frames - 1, min(frames, SAMPLES)).round().astype(int)
+        some = np.flatnonzero(seen == 0)
+        median[some], seen[some] = _median_of(colours, depths, still, some, sample)
+        rare = some[seen[some] < min(FEW, len(sample))]
+        median[rare], seen[rare] = _median_of(colours, depths, still, rare, np.arange(frames))
     unknown = (seen == 0).reshape(height, width)
     picture = median[:, :3].round().astype(np.uint8).reshape(height, width, 3)
     if unknown.any() and not unknown.all():
@@ -66,6 +65,19 @@ def empty_scene(
         torch.from_numpy(median[:, 3].reshape(height, width)),
         torch.from_numpy(seen.reshape(height, width)),
     )
+
+
+def _median_of(
+    colours: UInt8[ndarray, "t p 3"],
+    depths: Float[ndarray, "t p"],
+    still: Bool[ndarray, "t p"],
+    pixels: Int[ndarray, " q"],
+    frames: Int[ndarray, " s"],
+) -> tuple[Float32[ndarray, "q 4"], Int[ndarray, " q"]]:
+    """Median colour and depth of some pixels over those of some frames in which they are still; how many these are."""
+    rows = np.ix_(frames, pixels)
+    values = np.concatenate((colours[rows], depths[rows][..., None]), axis=-1, dtype=np.float32)
+    return _masked_median(values, still[rows]), still[rows].sum(0)
 
 
 def _masked_median(values: Float32[ndarray, "t p c"], usable: Bool[ndarray, "t p"]) -> Float32[ndarray, "p c"]:

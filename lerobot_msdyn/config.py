@@ -12,6 +12,7 @@ import draccus
 
 # Named: draccus finds the comment above a field only where its annotation holds no quotes.
 Device = Literal["auto", "cpu", "cuda"]
+Fill = Literal["inpaint", "nearest", "none"]
 LevelName = Literal["object", "primitive", "grain", "particle", "flat", "field"]
 
 
@@ -74,6 +75,8 @@ class SceneConfig:
     mask_border_px: int = 1
     # Side of the voxels in which the gathered moving points are merged, in pixels of the fitted image.
     moving_voxel_px: float = 0.8
+    # Whether what the motion does not explain of a frame is shown as it was recorded, at that frame.
+    overlay: bool = True
     # Balls instead of ellipsoids.
     isotropic: bool = False
 
@@ -169,7 +172,10 @@ class FitConfig:
 
 @dataclass
 class PerturbationConfig(draccus.ChoiceRegistry):
-    """How the camera of a new episode differs from the recorded one: one draw per new episode."""
+    """How the camera of a new episode differs from the recorded one (docs/perturbations.md)."""
+
+    # Whether every frame has a draw of its own, for policies that see single frames; else one per new episode.
+    per_frame: bool = False
 
 
 @PerturbationConfig.register_subclass("orbit")
@@ -181,8 +187,54 @@ class OrbitConfig(PerturbationConfig):
     azimuth_deg: float = 10.0
     # Largest turn up or down, in degrees.
     elevation_deg: float = 5.0
-    # Largest shift along each of the camera's axes, as a fraction of the distance to the look-at point.
+    # Largest shift along each of the camera's axes in metres, where the scale is metric.
+    translation_m: float = 0.02
+    # The same as a fraction of the distance to the look-at point, where it is not.
     translation_rel: float = 0.03
+
+
+@PerturbationConfig.register_subclass("translation")
+@dataclass
+class TranslationConfig(PerturbationConfig):
+    """Shift the camera without turning it."""
+
+    # Largest shift along each of the camera's axes in metres, where the scale is metric.
+    translation_m: float = 0.04
+    # The same as a fraction of the distance to the look-at point, where it is not.
+    translation_rel: float = 0.06
+
+
+@PerturbationConfig.register_subclass("rotation")
+@dataclass
+class RotationConfig(PerturbationConfig):
+    """Turn the camera in place."""
+
+    # Largest turn to either side, in degrees.
+    pan_deg: float = 3.0
+    # Largest turn up or down, in degrees.
+    tilt_deg: float = 3.0
+    # Largest turn about the optical axis, in degrees.
+    roll_deg: float = 3.0
+
+
+@PerturbationConfig.register_subclass("dolly")
+@dataclass
+class DollyConfig(PerturbationConfig):
+    """Move the camera along its optical axis."""
+
+    # Largest way forth or back in metres, where the scale is metric.
+    translation_m: float = 0.06
+    # The same as a fraction of the distance to the look-at point, where it is not.
+    translation_rel: float = 0.1
+
+
+@PerturbationConfig.register_subclass("focal")
+@dataclass
+class FocalConfig(PerturbationConfig):
+    """Change the focal length."""
+
+    # Largest change: 0.1 makes it up to 1.1 times as long or as short.
+    zoom: float = 0.1
 
 
 @PerturbationConfig.register_subclass("jitter")
@@ -190,10 +242,47 @@ class OrbitConfig(PerturbationConfig):
 class JitterConfig(PerturbationConfig):
     """Shift and turn the camera in place, as if it had been bumped."""
 
-    # Standard deviation of the shift along each of the camera's axes, as a fraction of the look-at distance.
+    # Standard deviation of the shift along each of the camera's axes in metres, where the scale is metric.
+    translation_m: float = 0.012
+    # The same as a fraction of the look-at distance, where it is not.
     translation_rel: float = 0.02
     # Standard deviation of the turn about each of the camera's axes, in degrees.
     rotation_deg: float = 1.0
+
+
+@PerturbationConfig.register_subclass("drift")
+@dataclass
+class DriftConfig(PerturbationConfig):
+    """Move the camera smoothly along the episode, about the point it looks at."""
+
+    # Largest turn to either side, in degrees.
+    azimuth_deg: float = 6.0
+    # Largest turn up or down, in degrees.
+    elevation_deg: float = 3.0
+    # Largest shift along each of the camera's axes in metres, where the scale is metric.
+    translation_m: float = 0.02
+    # The same as a fraction of the distance to the look-at point, where it is not.
+    translation_rel: float = 0.03
+    # How often it goes back and forth in an episode.
+    cycles: float = 0.5
+
+
+@PerturbationConfig.register_subclass("poses")
+@dataclass
+class PosesConfig(PerturbationConfig):
+    """Given poses, one after the other over the variants."""
+
+    # Each the first three rows of (new camera from recorded camera), 12 numbers row by row; metres.
+    poses: list[list[float]] = field(default_factory=list)
+
+
+@PerturbationConfig.register_subclass("other_camera")
+@dataclass
+class OtherCameraConfig(PerturbationConfig):
+    """Look from where another calibrated camera stands."""
+
+    # Its name in the calibration file.
+    camera: str = ""
 
 
 @dataclass
@@ -218,6 +307,16 @@ class Recipe:
     motion: MotionConfig = field(default_factory=MotionConfig)
     fit: FitConfig = field(default_factory=FitConfig)
     perturbation: PerturbationConfig = field(default_factory=OrbitConfig)
+    # Largest share of a new view that no frame has shown, 0..1; a change that shows more is shrunk, or rejected.
+    max_unseen: float = 0.2
+    # What stands where nothing was seen: inpaint (continued from what is behind), nearest, or none (black).
+    fill: Fill = "inpaint"
+    # Cut off what was not seen at the borders: a longer focal length at the same number of pixels.
+    crop_to_covered: bool = False
+    # Keep masks of what was not seen, per frame, in meta/msdyn/unseen/.
+    masks: bool = False
+    # Whether cameras that move with the robot may be re-rendered; their pictures are tied to its state.
+    allow_moving: bool = False
 
     @property
     def needs_whole_videos(self) -> bool:
@@ -320,11 +419,41 @@ def problems(config: object, prefix: str = "") -> list[str]:
             f"{prefix}levels is [{', '.join(config.levels)}]; expected [object], then any of primitive, grain (after "
             "primitive) and particle in this order; or [flat] or [field] alone"
         )
+    lines += [prefix + line for line in _perturbation_problems(config)]
     for item in fields(config):  # type: ignore[arg-type]
         value = getattr(config, item.name)
         if is_dataclass(value):
             lines += problems(value, f"{prefix}{item.name}.")
     return lines
+
+
+def _perturbation_problems(config: object) -> list[str]:
+    lines = []
+    if isinstance(config, PosesConfig):
+        if not config.poses:
+            lines.append("poses is empty; expected at least one pose of 12 numbers")
+        lines += [
+            f"poses[{number}] is no rigid motion; expected 12 numbers, three rows of a rotation and a shift in metres"
+            for number, pose in enumerate(config.poses)
+            if not _is_rigid(pose)
+        ]
+    if isinstance(config, OtherCameraConfig) and not config.camera:
+        lines.append("camera is empty; expected the name of a camera in the calibration file")
+    if isinstance(config, DriftConfig | PosesConfig | OtherCameraConfig) and config.per_frame:
+        lines.append("per_frame is true; expected false for this type, which draws nothing per frame")
+    return lines
+
+
+def _is_rigid(pose: list[float]) -> bool:
+    """Whether 12 numbers, row by row, are a rotation and a shift."""
+    if len(pose) != 12:
+        return False
+    x, y, z = pose[0:3], pose[4:7], pose[8:11]
+    products = [sum(p * q for p, q in zip(a, b, strict=True)) for a in (x, y, z) for b in (x, y, z)]
+    identity = [1, 0, 0, 0, 1, 0, 0, 0, 1]
+    crossed = (x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0])
+    right_handed = sum(p * q for p, q in zip(crossed, z, strict=True)) > 0
+    return right_handed and all(abs(p - q) < 1e-3 for p, q in zip(products, identity, strict=True))
 
 
 def _is_hierarchy(levels: list[LevelName]) -> bool:
@@ -347,7 +476,8 @@ _PROVIDERS: dict[str, dict[str, tuple[str, ...]]] = {
     },
 }
 _ANY = float("inf")
-_RECIPE_RANGES = (("variants", 1, 1000),)
+_RECIPE_RANGES = (("variants", 1, 1000), ("max_unseen", 0, 1))
+_SHIFT = (("translation_m", 0, 10), ("translation_rel", 0, 0.9))
 # Class -> (field, smallest, largest value).
 _RANGES: dict[str, tuple[tuple[str, float, float], ...]] = {
     "Recipe": _RECIPE_RANGES,
@@ -383,6 +513,11 @@ _RANGES: dict[str, tuple[tuple[str, float, float], ...]] = {
         ("patience", 1, 1_000_000),
     ),
     "MixedViewsConfig": (("probability", 0, 1), ("seed", 0, 2**32 - 1), ("memory_mb", 0, _ANY)),
-    "OrbitConfig": (("azimuth_deg", 0, 90), ("elevation_deg", 0, 60), ("translation_rel", 0, 1)),
-    "JitterConfig": (("translation_rel", 0, 1), ("rotation_deg", 0, 45)),
+    "OrbitConfig": (("azimuth_deg", 0, 90), ("elevation_deg", 0, 60), *_SHIFT),
+    "TranslationConfig": _SHIFT,
+    "RotationConfig": tuple((name, 0, 45) for name in ("pan_deg", "tilt_deg", "roll_deg")),
+    "DollyConfig": _SHIFT,
+    "FocalConfig": (("zoom", 0, 1),),
+    "JitterConfig": (*_SHIFT, ("rotation_deg", 0, 45)),
+    "DriftConfig": (("azimuth_deg", 0, 90), ("elevation_deg", 0, 60), *_SHIFT, ("cycles", 0, 100)),
 }

@@ -28,6 +28,7 @@ VIDEO_BACKEND = "pyav"
 TIMESTAMP_TOLERANCE_S = 1e-4
 CODEBASE_VERSION = "v3.0"
 MILLIMETRES = 1000.0
+ON_ROBOT = ("wrist", "hand", "gripper", "palm", "finger", "effector", "flange", "tool")  # in names of cameras
 
 
 @dataclass(frozen=True)
@@ -135,15 +136,15 @@ def colour_cameras(meta: LeRobotDatasetMetadata) -> list[str]:
     return [key for key in meta.camera_keys if key not in meta.depth_keys]
 
 
-def select_cameras(meta: LeRobotDatasetMetadata, cameras: list[str] | None) -> list[str]:
-    """The cameras to re-render: those asked for (by key or its last part), else all that are not on the wrist.
+def select_cameras(meta: LeRobotDatasetMetadata, cameras: list[str] | None, *, allow_moving: bool = False) -> list[str]:
+    """The cameras to re-render: those asked for (by key or its last part), else all that are not on the robot.
 
     Raises:
-        DatasetError: a name is unknown, or no camera is left.
+        DatasetError: a name is unknown or of a camera on the robot, or no camera is left.
     """
     known = colour_cameras(meta)
     if cameras is None:
-        chosen = [key for key in known if not is_wrist_camera(key)]
+        chosen = [key for key in known if allow_moving or not is_wrist_camera(key)]
         if not chosen:
             raise DatasetError(
                 f"{meta.repo_id}: no camera to re-render; its colour cameras are {', '.join(known) or 'none'}"
@@ -155,13 +156,19 @@ def select_cameras(meta: LeRobotDatasetMetadata, cameras: list[str] | None) -> l
         if not matches:
             raise DatasetError(f"{meta.repo_id}: no colour camera {name!r}; it has {', '.join(known) or 'none'}")
         chosen += [key for key in matches if key not in chosen]
+    on_robot = [key for key in chosen if is_wrist_camera(key)]
+    if on_robot and not allow_moving:
+        raise DatasetError(
+            f"{meta.repo_id}: {', '.join(on_robot)} moves with the robot, by its name: its picture is tied to the "
+            "state, and would belong to another one; leave it out, or allow it by --allow_moving"
+        )
     return chosen
 
 
 def is_wrist_camera(key: str) -> bool:
     """Whether a camera's name says that it moves with the robot."""
     name = key.rsplit(".", 1)[-1].lower()
-    return any(word in name for word in ("wrist", "hand", "gripper", "palm"))
+    return any(word in name for word in ON_ROBOT)
 
 
 def read_rows(meta: LeRobotDatasetMetadata, index: int) -> pa.Table:

@@ -10,9 +10,10 @@ from lerobot.datasets import LeRobotDatasetMetadata
 
 from lerobot_msdyn.config import Recipe
 from lerobot_msdyn.episode import View, read_episode
-from lerobot_msdyn.pipeline import FURTHER_STEPS, by_feature, new_pictures, reconstruct
+from lerobot_msdyn.pipeline import FURTHER_STEPS, by_feature, reconstruct
 from lerobot_msdyn.shared import MAX_EPISODES
 from lerobot_msdyn.staging import stage_pictures
+from lerobot_msdyn.views import new_pictures
 
 PROBE_FRAMES = 24
 PROBE_STEPS = 14

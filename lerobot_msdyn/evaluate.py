@@ -44,7 +44,8 @@ def evaluate_nvs(config: EvaluateConfig) -> dict[str, float]:
 
     from lerobot_msdyn.cameras import CameraTrack
     from lerobot_msdyn.episode import open_source, read_episode, select_cameras
-    from lerobot_msdyn.pipeline import new_pictures, reconstruct
+    from lerobot_msdyn.pipeline import reconstruct
+    from lerobot_msdyn.views import new_pictures
 
     seconds: dict[str, float] = {}
     start = time.perf_counter()

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from kornia.geometry.conversions import (
     axis_angle_to_rotation_matrix,
     quaternion_to_rotation_matrix,
+    rotation_matrix_to_axis_angle,
     rotation_matrix_to_quaternion,
 )
 from torch import Tensor
@@ -28,6 +29,11 @@ def axis_angle_to_matrix(axis_angle: Float[Tensor, "*batch 3"]) -> Float[Tensor,
     """Rotation matrices of rotation vectors (direction = axis, length = angle in radians)."""
     flat = axis_angle_to_rotation_matrix(axis_angle.reshape(-1, 3))
     return flat.reshape(*axis_angle.shape[:-1], 3, 3)
+
+
+def matrix_to_axis_angle(rotations: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+    """Rotation vectors of rotation matrices."""
+    return rotation_matrix_to_axis_angle(rotations.reshape(-1, 3, 3)).reshape(*rotations.shape[:-2], 3)
 
 
 def rotation_6d_to_matrix(sixd: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 3 3"]:

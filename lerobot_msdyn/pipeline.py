@@ -5,27 +5,26 @@ import functools
 import itertools
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float32, UInt8
 from lerobot.datasets import LeRobotDatasetMetadata
 from torch import Tensor
 
 from lerobot_msdyn import saved
 from lerobot_msdyn.background import empty_scene
-from lerobot_msdyn.cameras import CameraTrack, concatenated
-from lerobot_msdyn.config import Recipe, SceneConfig
+from lerobot_msdyn.bounds import NewCameras, new_cameras
+from lerobot_msdyn.cameras import concatenated, read_calibration
+from lerobot_msdyn.config import OtherCameraConfig, Recipe, SceneConfig
+from lerobot_msdyn.coverage import Evidence, evidence_of
 from lerobot_msdyn.episode import View, depth_key_of, read_episode, shrink
-from lerobot_msdyn.errors import EpisodeError
+from lerobot_msdyn.errors import ConfigError, EpisodeError
 from lerobot_msdyn.fitting import FitResult, fit
 from lerobot_msdyn.initialisation import initialise
-from lerobot_msdyn.perturbation import draw_offset, draw_rng, look_at_distance, perturb
+from lerobot_msdyn.perturbation import look_at_distance
 from lerobot_msdyn.priors import PointTracks, Priors, estimate_priors
-from lerobot_msdyn.provenance import SOURCE_VARIANT, Provenance
-from lerobot_msdyn.quality import HOLE_ALPHA, fill_holes
-from lerobot_msdyn.rendering import render_frames
+from lerobot_msdyn.provenance import SOURCE_VARIANT, Provenance, camera_pose
 from lerobot_msdyn.saved import SavedScene, SceneSource
 from lerobot_msdyn.shared import (
     MAX_EPISODES,
@@ -35,6 +34,8 @@ from lerobot_msdyn.shared import (
     few_frames,
     share_backgrounds,
 )
+from lerobot_msdyn.unexplained import unexplained
+from lerobot_msdyn.views import Picture, Reconstruction, UnseenMasks, new_pictures
 from lerobot_msdyn.write import NewEpisode, OutputDataset
 
 logger = logging.getLogger(__name__)
@@ -42,35 +43,11 @@ logger = logging.getLogger(__name__)
 SHARP_DEPTH = ("recorded", "plane")  # providers whose depth has sharp edges and agrees between frames
 ROUGH_BORDER_PX = 2  # with the others' depth: from the border of a mask ...
 ROUGH_FRAMES = 6  # ... and so few frames are gathered, whose depths disagree
+ATTEMPTS = 3  # draws of one new episode before it is given up
 FURTHER_STEPS = 0.6  # share of the fit's steps that suffices where the static set has been fitted already
 
 Backgrounds = Mapping[str, Sequence[SharedBackground]]  # by camera
 Progress = Callable[[str, float], object]  # (what is being done, share of the episode done since the last call)
-
-
-@dataclass(frozen=True)
-class Reconstruction:
-    """One camera's scenes, one per window of its video, and what was known about it."""
-
-    results: tuple[FitResult, ...]
-    starts: tuple[int, ...]  # first frame of each window
-    metric: bool  # whether depth is in true metres
-    provenance: dict[str, dict[str, str]]  # prior -> provider, why, model and licence, of the first window
-    camera: CameraTrack  # at the size of the recorded video
-    distance: float  # m, to the look-at point
-
-    @property
-    def seconds(self) -> float:
-        """Time that was spent in fitting."""
-        return sum(result.seconds for result in self.results)
-
-
-@dataclass(frozen=True)
-class Picture:
-    """One frame of a new view."""
-
-    rgb: UInt8[np.ndarray, "h w 3"]
-    depth: Float32[np.ndarray, "h w"]  # m, z-depth; 0 where nothing is known, and everywhere if there is no true scale
 
 
 def shared_backgrounds(source: LeRobotDatasetMetadata, cameras: list[str], recipe: Recipe) -> Backgrounds:
@@ -144,18 +121,15 @@ def augment_episode(
             key=key,
         )
     priors = {key: scene.provenance for key, scene in scenes.items()}
+    other = _other_pose(recipe, index, episode.views[cameras[0]])
     new = []
     if recipe.include_source:
         new.append(NewEpisode(index, Provenance(source.repo_id, index, SOURCE_VARIANT, recipe.seed, {}, priors)))
     for variant in range(recipe.variants):
         progress(f"episode {index}: rendering variant {variant}", 0.0)
-        rng = draw_rng(recipe.seed, index, variant)
-        pictures, drawn = {}, {}
-        for key, scene in scenes.items():
-            offset, drawn[key] = draw_offset(recipe.perturbation, scene.distance, rng)
-            pictures[key] = new_pictures(scene, perturb(scene.camera, offset))
-        provenance = Provenance(source.repo_id, index, variant, recipe.seed, drawn, priors)
-        new.append(output.stage(index, variant, by_feature(source, pictures), provenance))
+        found = _accepted(scenes, recipe, index, variant, other)
+        if found is not None:
+            new.append(_staged(source, index, variant, recipe, output, scenes, found))
         progress("", 0.5 / recipe.variants)
     if recipe.save_scenes:
         for key, scene in scenes.items():
@@ -166,9 +140,63 @@ def augment_episode(
 def to_saved(scene: Reconstruction, source: SceneSource) -> SavedScene:
     """What of a reconstruction is kept."""
     windows = tuple(result.scene for result in scene.results)
-    return SavedScene(
-        source, windows, scene.starts, scene.camera, scene.metric, scene.distance, scene.provenance
+    return SavedScene(source, windows, scene.starts, scene.camera, scene.metric, scene.distance, scene.provenance)
+
+
+def _accepted(
+    scenes: Mapping[str, Reconstruction], recipe: Recipe, index: int, variant: int, other: Tensor | None
+) -> NewCameras | None:
+    """The cameras of one new episode, drawn again where they show too much that was never seen; None: given up."""
+    for attempt in range(ATTEMPTS):
+        found = new_cameras(scenes, recipe, index, variant, attempt, other)
+        if not found.rejected:
+            return found
+        logger.warning("episode %d variant %d, draw %d: rejected: %s", index, variant, attempt, found.rejected)
+    return None
+
+
+def _staged(
+    source: LeRobotDatasetMetadata,
+    index: int,
+    variant: int,
+    recipe: Recipe,
+    output: OutputDataset,
+    scenes: Mapping[str, Reconstruction],
+    found: NewCameras,
+) -> NewEpisode:
+    """One new episode, rendered and encoded."""
+    pictures = {key: new_pictures(scene, found.cameras[key], fill=recipe.fill) for key, scene in scenes.items()}
+    masks = UnseenMasks() if recipe.masks else None
+    if masks is not None:
+        pictures = {key: masks.kept(key, some) for key, some in pictures.items()}
+    provenance = Provenance(
+        source.repo_id,
+        index,
+        variant,
+        recipe.seed,
+        found.drawn,
+        {key: scene.provenance for key, scene in scenes.items()},
+        {key: camera_pose(scene.camera, found.cameras[key]) for key, scene in scenes.items()},
     )
+    new = output.stage(index, variant, by_feature(source, pictures), provenance)
+    return new if masks is None else replace(new, masks=masks.arrays())
+
+
+def _other_pose(recipe: Recipe, index: int, view: View) -> Tensor | None:
+    """World from the camera that `other_camera` names."""
+    config = recipe.perturbation
+    if not isinstance(config, OtherCameraConfig):
+        return None
+    camera = None
+    if recipe.camera.calibration is not None:
+        height, width = view.rgb.shape[1:3]
+        camera = read_calibration(recipe.camera.calibration, config.camera, index, 1, width, height)
+    if camera is None:
+        raise ConfigError(
+            f"perturbation.camera is {config.camera!r}, which the calibration {recipe.camera.calibration} does not "
+            "name; expected a camera with K, R and t there (--camera.calibration FILE)"
+        )
+    return camera.world_from_camera[0]
 
 
 def reconstruct(
@@ -208,10 +236,10 @@ def reconstruct(
             device=recipe.device,
         )
         fitted.append(_fit_window(shrink(window, recipe.fit.max_width), recipe, within, backgrounds, priors_of))
-    results, known, distances, cameras = zip(*fitted, strict=True)
+    results, known, distances, evidence = zip(*fitted, strict=True)
     starts = tuple(start for start, _ in windows)
-    camera = concatenated(cameras).resized(view.camera.width, view.camera.height)
-    return Reconstruction(results, starts, known[0].metric, known[0].provenance, camera, distances[0])
+    camera = concatenated([part.camera for part in evidence]).resized(view.camera.width, view.camera.height)
+    return Reconstruction(results, starts, known[0].metric, known[0].provenance, camera, distances[0], evidence)
 
 
 def _windows(view: View, recipe: Recipe) -> list[tuple[int, View]]:
@@ -232,8 +260,8 @@ def _fit_window(
     progress: Callable[[float], object],
     backgrounds: Sequence[SharedBackground],
     priors_of: Callable[..., Priors],
-) -> tuple[FitResult, Priors, float, CameraTrack]:
-    """A fitted scene of one window at the size at which it is fitted, its priors, look-at distance (m) and camera."""
+) -> tuple[FitResult, Priors, float, Evidence]:
+    """A fitted scene of one window, its priors, look-at distance (m) and what was recorded, at the size of the fit."""
     steps, settings = recipe.fit.steps, recipe.scene
     with _one_torch_thread():
         shared = next((background for background in backgrounds if background.fits(view)), None)
@@ -263,7 +291,9 @@ def _fit_window(
         seed=recipe.seed,
         progress=lambda done: progress(done / steps),
     )
-    return result, priors, distance, view.camera
+    if settings.overlay:
+        result = replace(result, scene=replace(result.scene, overlay=unexplained(result.scene, view, priors)))
+    return result, priors, distance, evidence_of(result.scene, view.camera, empty)
 
 
 def _for_rough_depth(scene: SceneConfig) -> SceneConfig:
@@ -298,25 +328,3 @@ def by_feature(
             if depth_key is not None:
                 features[depth_key] = picture.depth
         yield features
-
-
-def new_pictures(scene: Reconstruction, camera: CameraTrack, frames: Tensor | None = None) -> Iterator[Picture]:
-    """The scene through another camera, holes filled; the share of holes is logged at the end.
-
-    `frames` (int, [t]) are those that the poses of `camera` belong to; default: all.
-    """
-    frames = torch.arange(len(scene.camera)) if frames is None else frames
-    window = torch.searchsorted(torch.tensor(scene.starts), frames, right=True) - 1
-    holes: list[float] = []
-    for index, count in zip(
-        *(values.tolist() for values in window.unique_consecutive(return_counts=True)), strict=True
-    ):
-        part = slice(len(holes), len(holes) + count)
-        result, times = scene.results[index], frames[part] - scene.starts[index]
-        for rendering in render_frames(result.scene, camera.select(part), times):
-            drawn = (rendering.rgb.clamp(0, 1) * 255).round().to(torch.uint8)
-            for rgb, alpha, depth in zip(drawn.numpy(), rendering.alpha.numpy(), rendering.depth.numpy(), strict=True):
-                filled, share = fill_holes(rgb, alpha)
-                holes.append(share)
-                yield Picture(filled, np.where((alpha >= HOLE_ALPHA) & scene.metric, depth, np.float32(0)))
-    logger.info("%.1f %% of the pixels were filled in (worst frame %.1f %%)", 100 * np.mean(holes), 100 * max(holes))

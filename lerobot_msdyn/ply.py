@@ -1,6 +1,7 @@
 """Gaussians as .ply files in the layout of 3D Gaussian Splatting (Kerbl et al. 2023), which common viewers open."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +13,21 @@ from lerobot_msdyn.errors import MsdynError
 from lerobot_msdyn.geometry import quaternion_multiply, quaternion_to_matrix
 from lerobot_msdyn.motion.compose import compose
 from lerobot_msdyn.saved import SavedScene
-from lerobot_msdyn.scene import SH_C0, DynamicScene, Gaussians, concatenate, rgb_to_sh
+from lerobot_msdyn.scene import (
+    PATCH_OPACITY,
+    SH_C0,
+    DynamicScene,
+    Gaussians,
+    concatenate,
+    gaussians_from_points,
+    rgb_to_sh,
+)
 
 _HEADER_BYTES = 64 * 1024  # no header is longer
 
 
 def gaussians_at(scene: DynamicScene, frame: int) -> Gaussians:
-    """All Gaussians of a scene as they are at one frame: moved, turned, and as bright as they are then."""
+    """All Gaussians of a scene as they are at one frame: moved, turned, as bright as then, overlaid by that frame's."""
     time = torch.tensor([frame])
     static, moving = scene.static, scene.moving
     means, quats = compose(moving.means, moving.quats, scene.levels, scene.indices, scene.logits, time)
@@ -30,12 +39,18 @@ def gaussians_at(scene: DynamicScene, frame: int) -> Gaussians:
     degree = max(colours.shape[1] for colours in sh)
     sh = [torch.nn.functional.pad(colours, (0, 0, 0, degree - colours.shape[1])) for colours in sh]
     log_scales = [part.log_scales.expand(-1, 3) for part in (static, moving)]
-    return concatenate(
+    own = concatenate(
         [
             Gaussians(static.means, static.quats, log_scales[0], static.opacity_logits, sh[0]),
             Gaussians(means[0], quats[0], log_scales[1], moving.opacity_logits, sh[1]),
         ]
     )
+    if scene.overlay is None:
+        return own
+    patch = scene.overlay.patch(frame, len(own))
+    shown = gaussians_from_points(patch.means, patch.quats, patch.log_scales.exp(), patch.rgb, PATCH_OPACITY)
+    flat = torch.nn.functional.pad(shown.sh, (0, 0, 0, degree - 1))
+    return concatenate([own.select(~patch.hidden), replace(shown, sh=flat)])
 
 
 def _turned(sh: Float[Tensor, "m k 3"], turn: Float[Tensor, "m 3 3"]) -> Float[Tensor, "m k 3"]:
@@ -117,7 +132,9 @@ def load_ply(path: Path) -> Gaussians:
 
     sh = columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None]
     if rest:
-        sh = torch.cat((sh, columns(*(f"f_rest_{i}" for i in range(rest))).reshape(count, 3, -1).transpose(1, 2)), dim=1)
+        sh = torch.cat(
+            (sh, columns(*(f"f_rest_{i}" for i in range(rest))).reshape(count, 3, -1).transpose(1, 2)), dim=1
+        )
     return Gaussians(
         means=columns("x", "y", "z"),
         quats=columns("rot_0", "rot_1", "rot_2", "rot_3"),

@@ -2,11 +2,19 @@
 
 import importlib.metadata
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lerobot_msdyn.cameras import CameraTrack
+from lerobot_msdyn.errors import OutputError
 
 FOLDER = Path("meta") / "msdyn"
 SOURCE_VARIANT = -1  # the variant of an episode that was copied, not rendered
@@ -24,6 +32,42 @@ class Provenance:
     priors: dict[str, dict[str, dict[str, str]]] = field(
         default_factory=dict
     )  # camera -> prior -> provider, why, model
+    views: dict[str, dict[str, Any]] = field(default_factory=dict)  # camera -> its `camera_pose`
+
+
+def camera_pose(source: CameraTrack, new: CameraTrack) -> dict[str, Any]:
+    """A new camera for the record: K (px), and camera_from_source, which maps the recorded camera's axes to its (m).
+
+    One 3x3 and one 4x4 matrix where they are the same at every frame, else one per frame; rounded to 1e-6.
+    """
+    change = new.camera_from_world.double() @ source.world_from_camera.double()
+    return {"K": _once(new.intrinsics), "camera_from_source": _once(change)}
+
+
+def _once(matrices: Float[Tensor, "t n n"]) -> list[Any]:
+    rounded = (matrices.double() * 1e6).round() / 1e6
+    return list((rounded[0] if bool((rounded == rounded[:1]).all()) else rounded).tolist())
+
+
+def write_unseen(root: Path, index: int, masks: Mapping[str, np.ndarray]) -> None:
+    """Write meta/msdyn/unseen/episode_000012.npz: the arrays of `UnseenMasks`."""
+    path = root / FOLDER / "unseen" / f"episode_{index:06d}.npz"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    arrays: dict[str, Any] = dict(masks)
+    np.savez_compressed(path, **arrays)
+
+
+def read_unseen(path: Path, camera: str) -> Bool[np.ndarray, "t h w"]:
+    """One camera's masks of a file that `write_unseen` wrote: True where nothing was ever seen.
+
+    Raises:
+        OutputError: it is not such a file, or does not have the camera.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return np.unpackbits(file[camera], axis=-1, count=int(file[f"{camera}.width"])).astype(bool)
+    except (OSError, ValueError, KeyError) as error:
+        raise OutputError(f"{path}: no masks of {camera!r} there ({error}); they are kept with --masks") from error
 
 
 def write_provenance(root: Path, episodes: list[Provenance], recipe_yaml: str) -> None:

@@ -1,15 +1,16 @@
 """Pictures of a dynamic scene: frames from a camera track."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from lerobot_msdyn.cameras import CameraTrack
+from lerobot_msdyn.overlay import FramePatch
 from lerobot_msdyn.render import Raster, rasterize
-from lerobot_msdyn.scene import DynamicScene
+from lerobot_msdyn.scene import DynamicScene, Snapshot, patched
 
 
 @dataclass(frozen=True)
@@ -19,33 +20,82 @@ class Rendering:
     rgb: Float[Tensor, "t h w 3"]  # 0..1, over black
     depth: Float[Tensor, "t h w"]  # m, expected z-depth; 0 where nothing is
     alpha: Float[Tensor, "t h w"]  # 0..1
-    moving: Float[Tensor, "t h w"]  # 0..1, share of the moving set
+    moving: Float[Tensor, "t h w"]  # 0..1, share of the moving set and of overlays
+    extra: Float[Tensor, "t h w"] | None = None  # values of the moving Gaussians, blended like colours
 
 
-def draw(scene: DynamicScene, camera: CameraTrack, frames: Tensor, backend: str = "auto") -> Rendering:
-    """The scene at `frames` (int, [b]) through the b poses of `camera`; differentiable."""
+def draw(
+    scene: DynamicScene,
+    camera: CameraTrack,
+    frames: Tensor,
+    backend: str = "auto",
+    extra: Float[Tensor, " m"] | None = None,
+) -> Rendering:
+    """The scene at `frames` (int, [b]) through the b poses of `camera`; differentiable.
+
+    `extra` is a value per moving Gaussian to be drawn as well; overlays have one of 1.
+    """
+    if scene.overlay is None:
+        return _rasterized(_snapshot(scene, camera, frames, extra), camera, backend)
+    own = len(scene.static) + len(scene.moving)
+    drawn = [
+        draw_patched(scene, camera.select([i]), frame, scene.overlay.patch(frame, own), backend, extra)
+        for i, frame in enumerate(frames.tolist())
+    ]
+    names = [item.name for item in fields(Rendering) if getattr(drawn[0], item.name) is not None]
+    return Rendering(**{name: torch.cat([getattr(one, name) for one in drawn]) for name in names})
+
+
+def draw_patched(
+    scene: DynamicScene,
+    camera: CameraTrack,
+    frame: int,
+    patch: FramePatch,
+    backend: str = "auto",
+    extra: Float[Tensor, " m"] | None = None,
+) -> Rendering:
+    """The scene at one frame through one pose, with a patch in place of what the patch hides."""
+    snapshot = _snapshot(scene, camera, torch.tensor([frame]), extra)
+    return _rasterized(patched(snapshot, patch), camera, backend)
+
+
+def _snapshot(scene: DynamicScene, camera: CameraTrack, frames: Tensor, extra: Float[Tensor, " m"] | None) -> Snapshot:
     snapshot = scene.at(frames, camera.world_from_camera[:, :3, 3])
+    if extra is None:
+        return snapshot
+    return replace(snapshot, extra=torch.cat((torch.zeros(len(scene.static)), extra)))
+
+
+def _rasterized(snapshot: Snapshot, camera: CameraTrack, backend: str) -> Rendering:
+    values = [snapshot.moving] if snapshot.extra is None else [snapshot.moving, snapshot.extra]
     raster: Raster = rasterize(
         snapshot.means,
         snapshot.quats,
         snapshot.scales,
         snapshot.opacities,
-        torch.cat((snapshot.rgb, snapshot.moving[:, None].expand(len(frames), -1, 1)), dim=-1),
+        torch.cat((snapshot.rgb, torch.stack(values, dim=-1).expand(len(camera), -1, -1)), dim=-1),
         camera.camera_from_world,
         camera.intrinsics,
         camera.width,
         camera.height,
         backend=backend,
     )
-    return Rendering(raster.features[..., :3], raster.depth, raster.alpha, raster.features[..., 3])
+    rgb, moving, *more = raster.features.split([3] + [1] * len(values), dim=-1)
+    return Rendering(rgb, raster.depth, raster.alpha, moving[..., 0], more[0][..., 0] if more else None)
 
 
 @torch.no_grad()
 def render_frames(
-    scene: DynamicScene, camera: CameraTrack, frames: Tensor | None = None, *, batch: int = 8, backend: str = "auto"
+    scene: DynamicScene,
+    camera: CameraTrack,
+    frames: Tensor | None = None,
+    *,
+    batch: int = 8,
+    backend: str = "auto",
+    extra: Float[Tensor, " m"] | None = None,
 ) -> Iterator[Rendering]:
     """The whole scene in batches of frames, so that memory stays bounded; `frames` (int, [t]) defaults to all."""
     frames = torch.arange(scene.frames) if frames is None else frames
     for start in range(0, len(frames), batch):
         part = slice(start, min(start + batch, len(frames)))
-        yield draw(scene, camera.select(part), frames[part], backend)
+        yield draw(scene, camera.select(part), frames[part], backend, extra)

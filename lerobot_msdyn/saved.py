@@ -142,7 +142,9 @@ def read_header(folder: Path) -> dict[str, Any]:
             f"{path}: not the header of a saved scene ({type(error).__name__}: {error}); docs/scenes.md has the format"
         ) from error
     if schema != SCHEMA_VERSION:
-        raise MsdynError(f"{path}: schema is {schema}; expected {SCHEMA_VERSION}; make it again with --save_scenes true")
+        raise MsdynError(
+            f"{path}: schema is {schema}; expected {SCHEMA_VERSION}; make it again with --save_scenes true"
+        )
     return dict(header)
 
 

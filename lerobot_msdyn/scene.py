@@ -15,10 +15,12 @@ from lerobot_msdyn.geometry import quaternion_multiply, quaternion_to_matrix
 from lerobot_msdyn.motion.bases import MotionLevel
 from lerobot_msdyn.motion.compose import Level, compose
 from lerobot_msdyn.motion.field import DeformationField
+from lerobot_msdyn.overlay import FramePatch, Overlay
 from lerobot_msdyn.shading import Shading
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 LEVEL_KINDS: dict[str, type] = {"bases": MotionLevel, "field": DeformationField}
+PATCH_OPACITY = 0.95  # of an overlay's Gaussians
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic
 SH_C1 = 0.4886025119029199  # of the three linear ones
 
@@ -101,6 +103,21 @@ class Snapshot:
     opacities: Float[Tensor, " g"]
     rgb: Float[Tensor, "b g 3"]
     moving: Float[Tensor, " g"]  # 1 for the moving set, 0 for the static one
+    extra: Float[Tensor, " g"] | None = None  # another value of each
+
+
+def patched(snapshot: Snapshot, patch: FramePatch) -> Snapshot:
+    """A snapshot of one frame, with a patch in place of what the patch hides; the patch counts as moving."""
+    kept, ones = ~patch.hidden, torch.ones(len(patch))
+    return Snapshot(
+        means=torch.cat((snapshot.means[:, kept], patch.means[None]), dim=1),
+        quats=torch.cat((snapshot.quats[:, kept], patch.quats[None]), dim=1),
+        scales=torch.cat((snapshot.scales[kept], patch.log_scales.exp())),
+        opacities=torch.cat((snapshot.opacities[kept], PATCH_OPACITY * ones)),
+        rgb=torch.cat((snapshot.rgb[:, kept], patch.rgb[None]), dim=1),
+        moving=torch.cat((snapshot.moving[kept], ones)),
+        extra=None if snapshot.extra is None else torch.cat((snapshot.extra[kept], ones)),
+    )
 
 
 @dataclass(frozen=True)
@@ -114,6 +131,7 @@ class DynamicScene:
     logits: tuple[Float[Tensor, "n _"], ...]  # per level: their weights before the softmax
     frames: int
     shading: Shading | None = None  # none: brightness does not change
+    overlay: Overlay | None = None  # none: nothing is shown as it was recorded
 
     def at(self, frames: Int[Tensor, " b"], eye: Float[Tensor, "b 3"] | None = None) -> Snapshot:
         """The scene at some frames, differentiable in all Gaussians and bases.
@@ -139,6 +157,8 @@ class DynamicScene:
         tensors: dict[str, Tensor] = {}
         if self.shading is not None:
             tensors |= {f"shading.{item.name}": getattr(self.shading, item.name) for item in fields(Shading)}
+        if self.overlay is not None:
+            tensors |= {f"overlay.{item.name}": getattr(self.overlay, item.name) for item in fields(Overlay)}
         for name, part in (("static", self.static), ("moving", self.moving)):
             tensors |= {f"{name}.{item.name}": getattr(part, item.name) for item in fields(part)}
         for i, level in enumerate(self.levels):
@@ -217,6 +237,7 @@ def load_scene(path: Path) -> DynamicScene:
             logits=tuple(tensors[f"levels.{i}.logits"] for i in range(len(kinds))),
             frames=header["frames"],
             shading=Shading(**part("shading", Shading)) if "shading.field" in tensors else None,
+            overlay=Overlay(**part("overlay", Overlay)) if "overlay.first" in tensors else None,
         )
     except KeyError as error:
         raise MsdynError(f"{path}: not a readable scene file ({error} is missing)") from error

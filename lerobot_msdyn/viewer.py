@@ -5,7 +5,7 @@ python -m lerobot_msdyn.viewer --repo local/ds --episode 0 [--scenes FOLDER] [--
 
 import logging
 import sys
-from pathlib import Path
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -49,7 +49,9 @@ def run(arguments: list[str]) -> int:
     show_episode(config, stream)
     stream.flush()
     if config.save is not None:
-        sys.stdout.write(f"{config.save}  {config.save.stat().st_size / 1e6:.0f} MB; open it with: rerun {config.save}\n")
+        sys.stdout.write(
+            f"{config.save}  {config.save.stat().st_size / 1e6:.0f} MB; open it with: rerun {config.save}\n"
+        )
     return EXIT_OK
 
 
@@ -145,7 +147,7 @@ def _log_gaussians(log: _Log, scene: "SavedScene") -> None:
             for number, (index, logit) in enumerate(zip(window.indices, window.logits, strict=True))
         }
         for frame in range(window.frames):
-            moving = gaussians_at(window, frame).select(slice(still, None))
+            moving = gaussians_at(replace(window, overlay=None), frame).select(slice(still, None))
             log.at(start + frame, "world/moving/points", _points(moving.means, moving.rgb, moving.scales))
             log.at(
                 start + frame, "world/moving/ellipsoids",
@@ -157,6 +159,9 @@ def _log_gaussians(log: _Log, scene: "SavedScene") -> None:
                     fill_mode="solid",
                 ),
             )  # fmt: skip
+            if window.overlay is not None:
+                patch = window.overlay.patch(frame, still + len(moving))
+                log.at(start + frame, "world/overlay", _points(patch.means, patch.rgb, patch.log_scales.exp()))
             for name, colours in by_level.items():
                 log.at(start + frame, f"world/motion/{name}", rr.Points3D(moving.means.numpy(), colors=colours))
 
@@ -187,15 +192,17 @@ def _log_camera(log: _Log, name: str, camera: "CameraTrack", distance: float) ->
 
 
 def _log_new_view(log: _Log, config: ViewerConfig, scene: "SavedScene", variant: int) -> None:
-    """One new camera of the recipe, its pictures, and where it sees what nobody saw."""
+    """One new camera as drawn by the recipe (before any bound), its pictures, and how opaque they are."""
     import rerun as rr
     import torch
 
-    from lerobot_msdyn.perturbation import draw_offset, draw_rng, perturb
+    from lerobot_msdyn.perturbation import Viewpoint, amounts_of, draw, moved
     from lerobot_msdyn.training.live import LiveScene
 
-    rng = draw_rng(config.seed, scene.source.episode, variant)
-    camera = perturb(scene.camera, draw_offset(config.perturbation, scene.distance, rng)[0])
+    key, view = scene.source.camera, Viewpoint(scene.camera, scene.distance, scene.metric)
+    share = draw(config.perturbation, config.seed, scene.source.episode, variant, len(scene))
+    amounts = amounts_of(config.perturbation, share, view, variant)
+    camera = moved(config.perturbation, {key: view}, {key: amounts})[key]
     _log_camera(log, f"new_{variant}", camera, scene.distance)
     live = LiveScene(scene)
     for frame in range(len(scene)):
@@ -235,9 +242,7 @@ def _blueprint(cameras: list[str], variants: int) -> Any:
         shown = [f"+ /{name}/world/**", f"- /{name}/world/motion/**", f"- /{name}/world/moving/ellipsoids"]
         space = rrb.Tabs(
             rrb.Spatial3DView(origin=f"{name}/world", name="scene", contents=shown),
-            rrb.Spatial3DView(
-                origin=f"{name}/world", name="levels of motion", contents=[f"+ /{name}/world/motion/**"]
-            ),
+            rrb.Spatial3DView(origin=f"{name}/world", name="levels of motion", contents=[f"+ /{name}/world/motion/**"]),
             rrb.Spatial3DView(
                 origin=f"{name}/world", name="ellipsoids", contents=[f"+ /{name}/world/moving/ellipsoids"]
             ),

@@ -31,7 +31,7 @@ from lerobot.datasets.video_utils import concatenate_video_files, get_video_dura
 from lerobot_msdyn import saved
 from lerobot_msdyn.episode import depth_units_per_metre, inside_root, read_colour, read_depth, read_rows
 from lerobot_msdyn.errors import OutputError
-from lerobot_msdyn.provenance import Provenance, write_provenance
+from lerobot_msdyn.provenance import Provenance, write_provenance, write_unseen
 from lerobot_msdyn.staging import StagedPictures, Stats, image_stats, stage_pictures
 from lerobot_msdyn.video import cut_video, encoder_of
 
@@ -45,6 +45,7 @@ class NewEpisode:
     source_index: int
     provenance: Provenance
     pictures: StagedPictures = field(default_factory=StagedPictures)  # none for a copy of the source's episode
+    masks: Mapping[str, np.ndarray] = field(default_factory=dict)  # of what was never seen, see `write_unseen`
 
 
 class OutputDataset:
@@ -92,6 +93,9 @@ class OutputDataset:
         folder = self._partial / "dataset"
         _Assembly(self.source, self.repo_id, folder).build(episodes)
         write_provenance(folder, [episode.provenance for episode in episodes], recipe_yaml)
+        for number, episode in enumerate(episodes):
+            if episode.masks:
+                write_unseen(folder, number, episode.masks)
         if self.scenes.is_dir():
             self.scenes.rename(folder / saved.FOLDER)
         if self.root.exists():

@@ -13,6 +13,7 @@ ONLY_IN = {
     "datatrove": {"engines"},
     "rerun": {"viewer"},
     "lerobot": {
+        "action_safety",
         "episode",
         "synthetic",
         "video",

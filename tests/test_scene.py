@@ -112,7 +112,7 @@ def test_all_kinds_of_levels_come_back(tmp_path: Path) -> None:
 
 def test_a_scene_without_some_of_its_arrays_is_named(tmp_path: Path) -> None:
     path = tmp_path / "scene.safetensors"
-    header = '{"schema": 2, "levels": ["bases"], "frames": 3}'
+    header = '{"schema": 3, "levels": ["bases"], "frames": 3}'
     save_file({"static.means": torch.zeros(1, 3)}, path, metadata={"lerobot_msdyn": header})
     with pytest.raises(MsdynError, match=r"not a readable scene file .*is missing"):
         load_scene(path)
@@ -151,5 +151,5 @@ def test_what_is_no_scene_is_named(tmp_path: Path) -> None:
     with pytest.raises(MsdynError, match="not a readable scene file"):
         load_scene(path)
     save_file({"a": torch.zeros(1)}, path, metadata={"lerobot_msdyn": '{"schema": 99}'})
-    with pytest.raises(MsdynError, match="scene schema is 99; expected 2"):
+    with pytest.raises(MsdynError, match="scene schema is 99; expected 3"):
         load_scene(path)

@@ -9,11 +9,11 @@ from jaxtyping import Bool, Float32, Int, UInt8
 from torch import Tensor
 
 from lerobot_msdyn.cameras import CameraTrack
+from lerobot_msdyn.coverage import HOLE_ALPHA
 from lerobot_msdyn.motion.bases import MotionLevel, level_affines
-from lerobot_msdyn.quality import HOLE_ALPHA
 from lerobot_msdyn.render import rasterize
 from lerobot_msdyn.saved import SavedScene
-from lerobot_msdyn.scene import DynamicScene
+from lerobot_msdyn.scene import DynamicScene, Snapshot, patched
 from lerobot_msdyn.training.posing import pose
 
 _COARSER = 4  # holes are filled at a quarter of the size
@@ -25,7 +25,9 @@ class LivePictures:
     """Some frames of a new view."""
 
     rgb: UInt8[np.ndarray, "t 3 h w"]
-    depth: Float32[np.ndarray, "t h w"]  # m, z-depth; 0 where nothing is known, and everywhere if there is no true scale
+    depth: Float32[
+        np.ndarray, "t h w"
+    ]  # m, z-depth; 0 where nothing is known, and everywhere if there is no true scale
     alpha: Float32[np.ndarray, "t h w"]  # 0..1: below one half nothing is known
 
 
@@ -71,6 +73,7 @@ class _LiveWindow:
         self._means = torch.cat((static.means, moving.means))
         self._quats = torch.cat((static.quats, moving.quats))
         self._rgb = torch.cat((static.rgb, moving.rgb))
+        self._is_moving = torch.cat((torch.zeros(len(static)), torch.ones(len(moving))))
         self._levels = [i for i, level in enumerate(scene.levels) if not _is_idle(level)]
         self._posable = all(isinstance(scene.levels[i], MotionLevel) for i in self._levels)
         if self._posable:
@@ -91,7 +94,15 @@ class _LiveWindow:
     @property
     def size_in_bytes(self) -> int:
         """Memory of the buffers."""
-        tensors = (self._static_rgb, self._scales, self._opacities, self._means, self._quats, self._rgb)
+        tensors = (
+            self._static_rgb,
+            self._scales,
+            self._opacities,
+            self._means,
+            self._quats,
+            self._rgb,
+            self._is_moving,
+        )
         return sum(tensor.nbytes for tensor in tensors)
 
     @torch.no_grad()
@@ -104,12 +115,17 @@ class _LiveWindow:
         if shading is not None:
             torch.mul(self._static_rgb, shading.static_gain(time)[0, :, None], out=self._rgb[: self._static])
             self._rgb[self._static :] *= shading.moving_gain(time)[0, :, None]
+        seen = Snapshot(
+            self._means[None], self._quats[None], self._scales, self._opacities, self._rgb[None], self._is_moving
+        )
+        if self._scene.overlay is not None:
+            seen = patched(seen, self._scene.overlay.patch(frame, len(self._means)))
         raster = rasterize(
-            self._means,
-            self._quats,
-            self._scales,
-            self._opacities,
-            self._rgb,
+            seen.means,
+            seen.quats,
+            seen.scales,
+            seen.opacities,
+            seen.rgb,
             camera.camera_from_world,
             camera.intrinsics,
             camera.width,

@@ -81,11 +81,10 @@ class MixedViews(torch.utils.data.Dataset):
     def _sample(self, index: int) -> dict[str, Any]:
         absolute = index if self._absolute is None else int(self._absolute[index])
         episode = int(np.searchsorted(self._starts, absolute, side="right")) - 1
-        rng = self.mixer.rng(absolute)
-        cameras = self.mixer.replaced(episode, rng)
+        cameras = self.mixer.replaced(episode, absolute)
         if not cameras:
             return dict(self.dataset[index])
-        pictures = self.mixer.draw(episode, absolute - int(self._starts[episode]), cameras, rng)
+        pictures = self.mixer.draw(episode, absolute - int(self._starts[episode]), absolute, cameras)
         return with_pictures(self.dataset, index, pictures, self.mixer)
 
 

@@ -59,15 +59,17 @@ class MixedStream(torch.utils.data.IterableDataset):
 
     def _mixed(self, item: dict[str, Any]) -> dict[str, Any]:
         """A sample, seen from elsewhere if its turn has come."""
-        episode, position = int(item["episode_index"]), int(item["frame_index"])
-        rng = self.mixer.rng(int(item["index"]))
-        pictures = self.mixer.draw(episode, position, self.mixer.replaced(episode, rng), rng)
+        episode, position, index = (int(item[key]) for key in ("episode_index", "frame_index", "index"))
+        pictures = self.mixer.draw(episode, position, index, self.mixer.replaced(episode, index))
         for key, found in pictures.items():
             windowed = item[key].ndim == 4
             if key in self.dataset.meta.depth_keys:
                 unit = self.dataset.depth_output_unit
                 item[key] = depth_sample(found, self.dataset.meta, key, unit, windowed=windowed)
             else:
-                image, transforms = colour_sample(found, item[key].dtype, windowed=windowed), self.dataset.image_transforms
+                image, transforms = (
+                    colour_sample(found, item[key].dtype, windowed=windowed),
+                    self.dataset.image_transforms,
+                )
                 item[key] = image if transforms is None else transforms(image)
         return item

@@ -11,7 +11,7 @@ from lerobot_msdyn import saved
 from lerobot_msdyn.geometry import axis_angle_to_matrix, se3
 from lerobot_msdyn.motion.bases import level_from_motions
 from lerobot_msdyn.motion.field import fit_field
-from lerobot_msdyn.perturbation import orbit_offset, perturb
+from lerobot_msdyn.perturbation import orbit_offset
 from lerobot_msdyn.rendering import draw
 from lerobot_msdyn.saved import SavedScene
 from lerobot_msdyn.scene import DynamicScene
@@ -32,9 +32,7 @@ def turning(scene: DynamicScene, bases: int = 3) -> DynamicScene:
         turns = size * torch.randn(bases, scene.frames, 3, generator=generator)
         turns[1:2, 1:] = torch.tensor([0.0, 0.0, torch.pi])
         shifts = 0.1 * torch.randn(bases, scene.frames, 3, generator=generator)
-        return level_from_motions(
-            se3(axis_angle_to_matrix(turns), shifts), torch.randn(bases, 3, generator=generator)
-        )
+        return level_from_motions(se3(axis_angle_to_matrix(turns), shifts), torch.randn(bases, 3, generator=generator))
 
     indices = tuple(torch.randint(bases, (count, j), generator=generator) for j in (1, 2))
     logits = tuple(torch.randn(count, j, generator=generator) for j in (1, 2))
@@ -62,7 +60,9 @@ def with_field(scene: DynamicScene) -> DynamicScene:
 def test_the_same_picture_as_the_renderer_draws(scene: SavedScene, change: object) -> None:
     scene = replace(scene, windows=tuple(change(window) for window in scene.windows))
     frames = torch.tensor([2, 8, 9])
-    camera = perturb(scene.camera.select(frames), orbit_offset(8.0, -4.0, scene.distance))
+    recorded = scene.camera.select(frames)
+    offset = orbit_offset(8.0, -4.0, scene.distance)
+    camera = replace(recorded, world_from_camera=recorded.world_from_camera @ offset)
     live = LiveScene(scene)
     for _ in range(2):  # buffers are used again
         found = live.draw(camera, frames)

@@ -66,9 +66,7 @@ def test_image_transforms_are_applied(desk: Path, desk_scenes: Path) -> None:
     assert torch.equal(negative[7][DEPTH], plain[7][DEPTH])
 
 
-def test_share_and_episodes_without_scenes(
-    desk: Path, desk_scenes: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_share_and_episodes_without_scenes(desk: Path, desk_scenes: Path, caplog: pytest.LogCaptureFixture) -> None:
     dataset = recorded(desk)
     with caplog.at_level(logging.WARNING, "lerobot_msdyn"):
         mixed = MixedViews(dataset, desk_scenes, 0.5)
@@ -118,7 +116,9 @@ def test_perturbations(desk: Path, desk_scenes: Path) -> None:
     dataset = recorded(desk)
     assert MixedViews(dataset, desk_scenes).mixer.perturbation == OrbitConfig(azimuth_deg=8.0), "that of the run"
     assert MixedViews(dataset, desk_scenes / saved.FOLDER).mixer.perturbation == OrbitConfig(azimuth_deg=8.0)
-    still = MixedViews(dataset, desk_scenes, 1.0, JitterConfig(0.0, 0.0))
+    still = MixedViews(
+        dataset, desk_scenes, 1.0, JitterConfig(translation_m=0.0, translation_rel=0.0, rotation_deg=0.0)
+    )
     assert (still[3][FRONT] - dataset[3][FRONT]).abs().mean() < 0.06
 
 

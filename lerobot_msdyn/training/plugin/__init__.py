@@ -51,9 +51,7 @@ def mixed(dataset: Any, config: MixedViewsConfig) -> MixedViews | MixedStream:
     """The dataset of a training script with views mixed in."""
     perturbation = None if config.perturbation is None else load_recipe(config.perturbation).perturbation
     kind = MixedStream if isinstance(dataset, StreamingLeRobotDataset) else MixedViews
-    views = kind(
-        dataset, config.scenes, config.probability, perturbation, config.seed, memory_mb=config.memory_mb
-    )
+    views = kind(dataset, config.scenes, config.probability, perturbation, config.seed, memory_mb=config.memory_mb)
     logger.info(
         "training on mixed views: %g %% of the samples of %d episodes are drawn from %s",
         100 * config.probability,

@@ -1,0 +1,60 @@
+"""Gaussians of single frames: what the recorded camera shows at a time and the motion of the scene does not explain."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float16, Int, UInt8
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class FramePatch:
+    """The Gaussians of one frame, and those of the scene's own that they replace."""
+
+    means: Float[Tensor, "n 3"]  # m
+    quats: Float[Tensor, "n 4"]  # wxyz
+    log_scales: Float[Tensor, "n 3"]  # log of standard deviations in m
+    rgb: Float[Tensor, "n 3"]  # 0..1
+    hidden: Bool[Tensor, " g"]  # the scene's Gaussians, static ones first, that are not drawn
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """The patches of all frames, one behind the other; 32 bytes a Gaussian, and a bit for each of the scene's own."""
+
+    first: Int[Tensor, " t1"]  # frame i has the rows first[i] to first[i + 1]
+    means: Float[Tensor, "n 3"]
+    quats: Float16[Tensor, "n 4"]
+    log_scales: Float16[Tensor, "n 3"]
+    rgb: Float16[Tensor, "n 3"]
+    hidden: UInt8[Tensor, "t bytes"]  # bits, most significant first
+
+    def patch(self, frame: int, gaussians: int) -> FramePatch:
+        """The patch of a frame of a scene with so many Gaussians of its own."""
+        rows = slice(int(self.first[frame]), int(self.first[frame + 1]))
+        bits = np.unpackbits(self.hidden[frame].numpy(), count=gaussians)
+        return FramePatch(
+            self.means[rows],
+            self.quats[rows].float(),
+            self.log_scales[rows].float(),
+            self.rgb[rows].float(),
+            torch.from_numpy(bits).bool(),
+        )
+
+
+def packed(patches: list[FramePatch]) -> Overlay:
+    """One overlay of the patches of all frames of a scene."""
+    hidden = np.stack([np.packbits(patch.hidden.numpy()) for patch in patches])
+    sizes = torch.tensor([0, *(len(patch) for patch in patches)])
+    return Overlay(
+        first=sizes.cumsum(0),
+        means=torch.cat([patch.means for patch in patches]),
+        quats=torch.cat([patch.quats for patch in patches]).to(torch.float16),
+        log_scales=torch.cat([patch.log_scales for patch in patches]).to(torch.float16),
+        rgb=torch.cat([patch.rgb for patch in patches]).to(torch.float16),
+        hidden=torch.from_numpy(hidden),
+    )
