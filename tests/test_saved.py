@@ -48,7 +48,7 @@ def test_what_is_saved_comes_back(scene: SavedScene, tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_read_is_named(scene: SavedScene, tmp_path: Path) -> None:
-    with pytest.raises(MsdynError, match="no saved scenes in .*--save_scenes true"):
+    with pytest.raises(MsdynError, match=r"no saved scenes in .*--save_scenes true"):
         saved.list_scenes(tmp_path)
     folder = saved.save(scene, tmp_path)
     header = folder / "scene.json"

@@ -25,9 +25,7 @@ class LivePictures:
     """Some frames of a new view."""
 
     rgb: UInt8[np.ndarray, "t 3 h w"]
-    depth: Float32[
-        np.ndarray, "t h w"
-    ]  # m, z-depth; 0 where nothing is known, and everywhere if there is no true scale
+    depth: Float32[np.ndarray, "t h w"]  # m, z-depth; 0 where nothing is known, and everywhere without a true scale
     alpha: Float32[np.ndarray, "t h w"]  # 0..1: below one half nothing is known
 
 
@@ -82,7 +80,8 @@ class _LiveWindow:
     def _prepare_bases(self) -> None:
         """One table for the bases of all levels."""
         scene, count = self._scene, len(self._scene.moving)
-        firsts = np.cumsum([0] + [len(scene.levels[i]) for i in self._levels])  # type: ignore[arg-type]
+        sizes = [len(level) for level in map(scene.levels.__getitem__, self._levels) if isinstance(level, MotionLevel)]
+        firsts: np.ndarray = np.cumsum([0, *sizes])
         indices = [scene.indices[i].numpy() + first for i, first in zip(self._levels, firsts[:-1], strict=True)]
         weights = [scene.logits[i].softmax(dim=-1).numpy() for i in self._levels]
         none = np.zeros((count, 0))

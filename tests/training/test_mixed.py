@@ -157,12 +157,12 @@ def test_scenes_from_memory(desk: Path, desk_scenes: Path) -> None:
 
 def test_bad_input_is_named(desk: Path, image_desk: Path, desk_scenes: Path, tmp_path: Path) -> None:
     dataset = recorded(desk)
-    with pytest.raises(ConfigError, match="probability is 2.0; expected a value from 0 to 1"):
+    with pytest.raises(ConfigError, match=r"probability is 2\.0; expected a value from 0 to 1"):
         MixedViews(dataset, desk_scenes, 2.0)
     with pytest.raises(MsdynError, match="no saved scenes"):
         MixedViews(dataset, tmp_path)
     scene = saved.load(saved.list_scenes(desk_scenes)[0][FRONT])
-    with pytest.raises(DatasetError, match="no camera 'observation.images.top'"):
+    with pytest.raises(DatasetError, match=r"no camera 'observation\.images\.top'"):
         MixedViews(dataset, {0: {"observation.images.top": scene}})
     with pytest.raises(DatasetError, match="the scene is of 6 frames of 64x48; expected 12 of 64x48"):
         MixedViews(dataset, {0: {FRONT: replace(scene, camera=scene.camera.select(slice(0, 6)))}})

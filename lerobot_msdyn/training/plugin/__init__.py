@@ -1,6 +1,6 @@
-"""Lets an unmodified `lerobot-train` train on mixed views (docs/training.md).
+r"""Lets an unmodified `lerobot-train` train on mixed views (docs/training.md).
 
-    LEROBOT_MSDYN_VIEWS="--scenes FOLDER --probability 0.5" \\
+    LEROBOT_MSDYN_VIEWS="--scenes FOLDER --probability 0.5" \
     lerobot-train --dataset.discover_packages_path=lerobot_msdyn.training.plugin ...
 
 LeRobot imports this package before it reads its own options; the import puts `MixedViews` around the dataset that the
@@ -73,7 +73,8 @@ def install(script: ModuleType, config: MixedViewsConfig) -> None:
             f"{script.__name__} has no {', '.join(missing)}: another LeRobot than 0.6; see docs/training.md, "
             "or wrap the dataset yourself with MixedViews"
         )
-    make, current = getattr(script, _MAKER), []
+    make = getattr(script, _MAKER)
+    current: list[MixedViews | MixedStream] = []
 
     @functools.wraps(make)
     def make_mixed(*arguments: Any, **options: Any) -> tuple[Any, Any]:
