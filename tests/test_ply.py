@@ -10,7 +10,7 @@ from lerobot_msdyn import saved
 from lerobot_msdyn.errors import MsdynError
 from lerobot_msdyn.geometry import axis_angle_to_matrix, matrix_to_quaternion
 from lerobot_msdyn.ply import export_frames, gaussians_at, load_ply, save_ply
-from lerobot_msdyn.scene import Gaussians, gaussians_from_points, shaded, with_slope
+from lerobot_msdyn.scene import Gaussians, gaussians_from_points, patched, shaded, with_slope
 
 
 def some_gaussians(count: int = 5) -> Gaussians:
@@ -60,10 +60,12 @@ def test_a_turned_gaussian_looks_as_the_renderer_shows_it() -> None:
 
 def test_frames_of_a_scene(desk_scenes: Path, tmp_path: Path) -> None:
     scene = saved.load(saved.list_scenes(desk_scenes)[0]["observation.images.front"])
+    overlaid, frame = scene.windows[1], torch.tensor([1])
+    scene = replace(scene, windows=tuple(replace(window, overlay=None) for window in scene.windows))
     paths = export_frames(scene, range(5, 8), tmp_path)
     assert [path.name for path in paths] == ["frame_000005.ply", "frame_000006.ply", "frame_000007.ply"]
     window, eye = scene.windows[1], torch.zeros(1, 3)
-    expected = window.at(torch.tensor([1]), eye)
+    expected = window.at(frame, eye)
     found = load_ply(paths[2])
     torch.testing.assert_close(found.means, expected.means[0])
     torch.testing.assert_close(found.scales, expected.scales)
@@ -72,6 +74,11 @@ def test_frames_of_a_scene(desk_scenes: Path, tmp_path: Path) -> None:
     still = len(window.static)
     torch.testing.assert_close(shaded(found.sh, sight)[0, still:], expected.rgb[0, still:], atol=1e-3, rtol=0)
     torch.testing.assert_close(found.rgb[:still], expected.rgb[0, :still], atol=1e-5, rtol=0)
+    if overlaid.overlay is not None:
+        patch = overlaid.overlay.patch(1, len(found))
+        shown = gaussians_at(overlaid, 1)
+        torch.testing.assert_close(shown.means, patched(overlaid.at(frame), patch).means[0])
+        torch.testing.assert_close(shown.rgb[-len(patch) :], patch.rgb)
     degree_0 = replace(window, moving=replace(window.moving, sh=window.moving.sh[:, :1]), shading=None)
     assert gaussians_at(degree_0, 0).sh.shape[1] == 1
     assert with_slope(found).sh.shape[1] == 4

@@ -10,7 +10,7 @@ from lerobot_msdyn.errors import ConfigError, DatasetError, OutputError
 pytest.importorskip("rerun")
 
 
-@pytest.mark.filterwarnings("ignore:load_recording is deprecated")
+@pytest.mark.filterwarnings("ignore:.*is deprecated since 0.32:DeprecationWarning")
 def test_a_recording_is_written(desk: Path, desk_scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     path = tmp_path / "episode.rrd"
     source = ["--repo", "local/desk", "--root", str(desk), "--scenes", str(desk_scenes)]

@@ -177,9 +177,9 @@ def filled(rgb: UInt8[np.ndarray, "3 h w"], known: Bool[np.ndarray, "h w"]) -> U
     mask = known.astype(np.uint8)
     height, width = known.shape
     coarse = (max(width // _COARSER, 1), max(height // _COARSER, 1))
-    weighted = [cv2.resize(plane, coarse, interpolation=cv2.INTER_AREA) for plane in rgb * mask]
+    weighted = [cv2.resize(plane, coarse, interpolation=cv2.INTER_AREA) for plane in (rgb * mask).astype(np.float32)]
     weight = cv2.resize(mask.astype(np.float32), coarse, interpolation=cv2.INTER_AREA)
-    pulled = _pulled(np.stack(weighted, axis=-1).astype(np.float32), weight).clip(0, 255).astype(np.uint8)
+    pulled = _pulled(np.stack(weighted, axis=-1), weight).clip(0, 255).round().astype(np.uint8)
     around = [cv2.resize(plane, (width, height), interpolation=cv2.INTER_LINEAR) for plane in pulled.transpose(2, 0, 1)]
     return np.stack([cv2.copyTo(plane, mask, hidden) for plane, hidden in zip(rgb, around, strict=True)])
 
