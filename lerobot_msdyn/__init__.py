@@ -12,6 +12,7 @@ _HOMES = {
     "DynamicScene": "scene",
     "Episode": "episode",
     "Gaussians": "scene",
+    "MixedViews": "training",
     "MsdynError": "errors",
     "OutputDataset": "write",
     "Priors": "priors",

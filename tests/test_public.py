@@ -11,6 +11,7 @@ NAMES = [
     "DynamicScene",
     "Episode",
     "Gaussians",
+    "MixedViews",
     "MsdynError",
     "OutputDataset",
     "Priors",
