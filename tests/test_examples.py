@@ -13,7 +13,7 @@ IN_CI = "01_demo.py"  # make demo
 SAYS = {
     "02_augment.py": r"2 episodes: the recorded one",
     "03_own_perturbation.py": r"four of 8 frames of the swing",
-    "04_own_prior.py": r"'depth': 'exchange'.*\n.* dB on the recorded camera",
+    "04_own_prior.py": r"'depth': 'file'.*\n.* dB on the recorded camera",
     "05_train_mixed.py": r"4 updates, 2 epochs, loss \d",
     "06_held_out_camera.py": r"(?s)\d dB\n.*\d dB\n",
     "07_export_scene.py": r"frame_000000.ply to frame_000007.ply",
