@@ -11,9 +11,10 @@ from torch import Tensor
 from lerobot_msdyn.cameras import CameraTrack
 from lerobot_msdyn.coverage import HOLE_ALPHA
 from lerobot_msdyn.motion.bases import MotionLevel, level_affines
+from lerobot_msdyn.overlay import FramePatch
 from lerobot_msdyn.render import rasterize
 from lerobot_msdyn.saved import SavedScene
-from lerobot_msdyn.scene import DynamicScene, Snapshot, patched
+from lerobot_msdyn.scene import PATCH_OPACITY, DynamicScene
 from lerobot_msdyn.training.posing import pose
 
 _COARSER = 4  # holes are filled at a quarter of the size
@@ -71,7 +72,6 @@ class _LiveWindow:
         self._means = torch.cat((static.means, moving.means))
         self._quats = torch.cat((static.quats, moving.quats))
         self._rgb = torch.cat((static.rgb, moving.rgb))
-        self._is_moving = torch.cat((torch.zeros(len(static)), torch.ones(len(moving))))
         self._levels = [i for i, level in enumerate(scene.levels) if not _is_idle(level)]
         self._posable = all(isinstance(scene.levels[i], MotionLevel) for i in self._levels)
         if self._posable:
@@ -93,15 +93,7 @@ class _LiveWindow:
     @property
     def size_in_bytes(self) -> int:
         """Memory of the buffers."""
-        tensors = (
-            self._static_rgb,
-            self._scales,
-            self._opacities,
-            self._means,
-            self._quats,
-            self._rgb,
-            self._is_moving,
-        )
+        tensors = (self._static_rgb, self._scales, self._opacities, self._means, self._quats, self._rgb)
         return sum(tensor.nbytes for tensor in tensors)
 
     @torch.no_grad()
@@ -114,17 +106,11 @@ class _LiveWindow:
         if shading is not None:
             torch.mul(self._static_rgb, shading.static_gain(time)[0, :, None], out=self._rgb[: self._static])
             self._rgb[self._static :] *= shading.moving_gain(time)[0, :, None]
-        seen = Snapshot(
-            self._means[None], self._quats[None], self._scales, self._opacities, self._rgb[None], self._is_moving
-        )
+        drawn = (self._means, self._quats, self._scales, self._opacities, self._rgb)
         if self._scene.overlay is not None:
-            seen = patched(seen, self._scene.overlay.patch(frame, len(self._means)))
+            drawn = self._overlaid(self._scene.overlay.patch(frame, len(self._means)))
         raster = rasterize(
-            seen.means,
-            seen.quats,
-            seen.scales,
-            seen.opacities,
-            seen.rgb,
+            *drawn,
             camera.camera_from_world,
             camera.intrinsics,
             camera.width,
@@ -133,6 +119,17 @@ class _LiveWindow:
         planes = raster.features[0].permute(2, 0, 1)  # as they lie in memory
         rgb = planes.clamp(0, 1).mul_(255).round_().to(torch.uint8)
         return rgb.numpy(), raster.depth[0].numpy(), raster.alpha[0].numpy()
+
+    def _overlaid(self, patch: FramePatch) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """The buffers with a patch behind them; what it hides gets no opacity, which is faster than `patched`."""
+        opacities = torch.full((len(patch),), PATCH_OPACITY)
+        return (
+            torch.cat((self._means, patch.means)),
+            torch.cat((self._quats, patch.quats)),
+            torch.cat((self._scales, patch.log_scales.exp())),
+            torch.cat((self._opacities.masked_fill(patch.hidden, 0.0), opacities)),
+            torch.cat((self._rgb, patch.rgb)),
+        )
 
     def _set_moving(self, time: Int[Tensor, " 1"], eye: Tensor) -> None:
         """Write positions, orientations and colours of the moving set at a time into the buffers."""
