@@ -58,6 +58,7 @@ def augment(
     """Run the job that the command line described and say how it went; returns the exit code."""
     from lerobot_msdyn.engines import plan, run_local
     from lerobot_msdyn.provenance import SOURCE_VARIANT
+    from lerobot_msdyn.report.build import write_report
     from lerobot_msdyn.write import OutputDataset, check_place
 
     start = time.perf_counter()
@@ -66,22 +67,28 @@ def augment(
         sys.stdout.write(plan(source, episodes, cameras, config) + f"would be written to {new_root}\n")
         return EXIT_OK
     with OutputDataset(source, new_repo_id, new_root) as output:
-        new, failures = run_local(source, episodes, cameras, config, output)
+        made, failures = run_local(source, episodes, cameras, config, output)
+        new = [episode for episode in made if not episode.dropped]
+        dropped = [f"episode {e.source_index} variant {e.provenance.variant}: {e.dropped}" for e in made if e.dropped]
         if not new:
-            first = failures[0] if failures else "every new view was rejected, see above; allow more by --max_unseen"
+            first = [*failures, *dropped][0]
             raise EpisodeError(f"no episode could be augmented; nothing was written. First: {first}")
         output.finish(new, draccus.dump(config))
+    report = write_report(source, new_root, made, [str(failure) for failure in failures], time.perf_counter() - start)
     rendered = sum(episode.provenance.variant != SOURCE_VARIANT for episode in new)
     sys.stdout.write(
         f"{len(episodes) - len(failures)} of {len(episodes)} episodes, {rendered} new ones "
         f"({config.variants} per episode, {', '.join(cameras)}), {time.perf_counter() - start:.0f} s\n"
         f"written to {new_root}\n"
+        f"look at {report}\n"
         f"train:  lerobot-train --dataset.repo_id={new_repo_id} --dataset.root={new_root} --policy.type=act "
         "--policy.push_to_hub=false\n"
     )
     for failure in failures:
         sys.stdout.write(f"skipped: {failure}\n")
-    return EXIT_SOME_EPISODES_FAILED if failures else EXIT_OK
+    for line in dropped:
+        sys.stdout.write(f"dropped: {line}\n")
+    return EXIT_SOME_EPISODES_FAILED if failures or dropped else EXIT_OK
 
 
 def main() -> None:

@@ -23,22 +23,24 @@ NEAR = 0.01  # a Gaussian counts as seen up to this share of its depth behind th
 MOVING_STEP = 2  # the moving set is measured at every second frame, and over three of these
 
 
-def static_shading(static: Gaussians, moving: int, view: View, priors: Priors) -> Shading:
+def static_shading(
+    static: Gaussians, moving: int, view: View, priors: Priors, empty: UInt8[Tensor, "h w 3"]
+) -> Shading:
     """Shading of the static set of a fixed camera; that of the `moving` others is one.
 
-    The gain of a pixel is the ratio of the frame to the empty scene, both without what moves, blurred over pixels and
+    The gain of a pixel is the ratio of the frame to the `empty` scene, both without what moves, blurred over pixels and
     averaged over three frames. Behind what moves it is that of its surroundings.
     """
     frames = len(view.rgb)
     if not view.camera.is_static:
         return no_shading(len(static), moving, frames)
-    empty = _grey(priors.empty.numpy())
-    sums = [_field_sums(view, priors, empty, t) for t in range(min(2, frames))]
+    still = _grey(empty.numpy())
+    sums = [_field_sums(view, priors, still, t) for t in range(min(2, frames))]
     fields = []
     for t in range(frames):
         fields.append(encode_gain(torch.from_numpy(_ratio(np.sum(sums, axis=0)))))
         if t + 2 < frames:
-            sums.append(_field_sums(view, priors, empty, t + 2))
+            sums.append(_field_sums(view, priors, still, t + 2))
         if t > 0:
             del sums[0]
     camera = view.camera.select([0])

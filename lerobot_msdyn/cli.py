@@ -27,8 +27,23 @@ EXIT_INTERRUPTED = 130
 
 def recipe_folder() -> Path:
     """The folder of the recipes that come with the package (in a checkout: at its top level)."""
-    installed = Path(__file__).parent / "recipes"
+    installed = Path(__file__).parent / "recipe_files"
     return installed if installed.is_dir() else Path(__file__).parent.parent / "recipes"
+
+
+def recipe_path(name: str) -> Path:
+    """The file of a recipe, given by that file or by the name of one that comes with the package.
+
+    Raises:
+        ConfigError: there is no such recipe.
+    """
+    path = Path(name)
+    if not path.is_file():
+        path = recipe_folder() / f"{name}.yaml"
+    if not path.is_file():
+        known = sorted(file.stem for file in recipe_folder().glob("*.yaml"))
+        raise ConfigError(f"no recipe {name!r}: neither a file nor one of {', '.join(known)}")
+    return path
 
 
 def read_recipe(name: str) -> dict[str, Any]:
@@ -37,12 +52,7 @@ def read_recipe(name: str) -> dict[str, Any]:
     Raises:
         ConfigError: there is no such recipe, or it is not a YAML mapping.
     """
-    path = Path(name)
-    if not path.is_file():
-        path = recipe_folder() / f"{name}.yaml"
-    if not path.is_file():
-        known = sorted(file.stem for file in recipe_folder().glob("*.yaml"))
-        raise ConfigError(f"no recipe {name!r}: neither a file nor one of {', '.join(known)}")
+    path = recipe_path(name)
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:

@@ -113,7 +113,7 @@ class MotionConfig:
     flat_bases: int = 10
     # Keep a finer level, part by part, only where it predicts tracks better that it was not fitted to.
     gate: bool = True
-    # Refine the rigid parts' poses by the recorded depth, colours and outlines; only where depth is metric.
+    # Find the rigid parts and their poses by the recorded depth, colours and outlines; only where depth is metric.
     register: bool = True
     frames_per_knot: FramesPerKnot = field(default_factory=FramesPerKnot)
 
@@ -286,6 +286,24 @@ class OtherCameraConfig(PerturbationConfig):
 
 
 @dataclass
+class GateConfig:
+    """Which new views are kept: each is judged without ground truth, at a few frames (docs/quality.md)."""
+
+    # Whether views are judged; without, all are kept.
+    enabled: bool = True
+    # Smallest expected peak signal-to-noise ratio of an episode, in dB.
+    min_expected_db: float = 14.0
+    # Largest median distance from the tracks to the motion, in pixels of the fitted image.
+    max_track_px: float = 8.0
+    # Largest flicker of what stands still, relative to the video's own.
+    max_flicker_ratio: float = 2.0
+    # Smallest sharpness (variance of the Laplacian), relative to the video's.
+    min_sharpness_ratio: float = 0.1
+    # How often a view that is rejected, by the gate or by max_unseen, is drawn again before it is dropped.
+    redraws: int = 3
+
+
+@dataclass
 class Recipe:
     """What to reconstruct and what to render; the fields of a recipe file."""
 
@@ -317,6 +335,7 @@ class Recipe:
     masks: bool = False
     # Whether cameras that move with the robot may be re-rendered; their pictures are tied to its state.
     allow_moving: bool = False
+    gate: GateConfig = field(default_factory=GateConfig)
 
     @property
     def needs_whole_videos(self) -> bool:
@@ -513,6 +532,13 @@ _RANGES: dict[str, tuple[tuple[str, float, float], ...]] = {
         ("patience", 1, 1_000_000),
     ),
     "MixedViewsConfig": (("probability", 0, 1), ("seed", 0, 2**32 - 1), ("memory_mb", 0, _ANY)),
+    "GateConfig": (
+        ("min_expected_db", 0, 60),
+        ("max_track_px", 0, _ANY),
+        ("max_flicker_ratio", 0, _ANY),
+        ("min_sharpness_ratio", 0, _ANY),
+        ("redraws", 0, 100),
+    ),
     "OrbitConfig": (("azimuth_deg", 0, 90), ("elevation_deg", 0, 60), *_SHIFT),
     "TranslationConfig": _SHIFT,
     "RotationConfig": tuple((name, 0, 45) for name in ("pan_deg", "tilt_deg", "roll_deg")),

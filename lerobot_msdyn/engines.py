@@ -10,7 +10,8 @@ from lerobot_msdyn.config import AugmentConfig
 from lerobot_msdyn.episode import depth_key_of
 from lerobot_msdyn.errors import ConfigError, EpisodeError, MsdynError
 from lerobot_msdyn.estimate import measure_speeds, predicted_seconds
-from lerobot_msdyn.pipeline import augment_episode, shared_backgrounds
+from lerobot_msdyn.pipeline import augment_episode
+from lerobot_msdyn.sharing import shared_backgrounds
 from lerobot_msdyn.write import NewEpisode, OutputDataset
 
 logger = logging.getLogger(__name__)

@@ -11,12 +11,13 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot_msdyn.config import Recipe
 from lerobot_msdyn.episode import View, read_episode
 from lerobot_msdyn.pipeline import FURTHER_STEPS, by_feature, reconstruct
-from lerobot_msdyn.shared import MAX_EPISODES
+from lerobot_msdyn.sharing import looked_at
 from lerobot_msdyn.staging import stage_pictures
 from lerobot_msdyn.views import new_pictures
 
 PROBE_FRAMES = 24
 PROBE_STEPS = 14
+MASKS_SHARE = 0.3  # of the time of priors and initial scene
 WARM_UP_STEPS = 4  # the first ones compile, and fill caches
 
 
@@ -77,8 +78,10 @@ def predicted_seconds(speeds: Speeds, source: LeRobotDatasetMetadata, episodes: 
     lengths = [int(source.episodes[index]["length"]) for index in episodes]
     steps, seconds = float(recipe.fit.steps), 0.0
     if recipe.scene.shared_background and source.total_episodes > 1:
-        looked_at = min(MAX_EPISODES, source.total_episodes)
-        seconds = looked_at * speeds.read_s * source.total_frames / source.total_episodes + steps / 2 * speeds.step_s
+        indices = looked_at(source.total_episodes)
+        apart = len(set(indices) - set(episodes))  # the masks of the others serve for their own fit as well
+        each_s = 2 * len(indices) * speeds.read_s + apart * MASKS_SHARE * speeds.prepare_s
+        seconds = each_s * source.total_frames / source.total_episodes + steps / 2 * speeds.step_s
         steps *= FURTHER_STEPS
     for frames in lengths:
         windows = -(-frames // recipe.fit.window_frames)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from lerobot_msdyn.brightness import moving_gain, static_shading
@@ -37,6 +37,7 @@ class FitResult:
     train_psnr_db: float  # over a few frames of the recorded camera
     steps: int  # how many were taken
     seconds: float
+    held_out: Int[Tensor, " b"]  # frames that were not fitted
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,7 @@ def fit(
     priors: Priors,
     config: FitConfig,
     *,
+    empty: UInt8[Tensor, "h w 3"],
     distance: float,
     seed: int,
     backend: str = "auto",
@@ -75,6 +77,7 @@ def fit(
         view: the video, at the size at which it is fitted.
         priors: its priors, at the same size.
         config: steps, weights and learning rates.
+        empty: what the camera sees where nothing moves, by which brightness is measured.
         distance: distance to the look-at point (m), the unit of the means' learning rate.
         seed: fixes the order of the frames.
         backend: of the rasterizer.
@@ -85,7 +88,7 @@ def fit(
     """
     start = time.perf_counter()
     if config.shadows:
-        scene = replace(scene, shading=static_shading(scene.static, len(scene.moving), view, priors))
+        scene = replace(scene, shading=static_shading(scene.static, len(scene.moving), view, priors, empty))
     if config.sh_degree > 0:
         scene = replace(scene, moving=with_slope(scene.moving))
     scene, optimizer = _trainable(scene, config.learning_rates, distance)
@@ -111,7 +114,7 @@ def fit(
             break
     if len(history) < config.steps:
         progress(config.steps - len(history))
-    return _result(_detached(scene), history, view, backend, time.perf_counter() - start)
+    return _result(_detached(scene), history, view, held_out, backend, time.perf_counter() - start)
 
 
 @torch.no_grad()
@@ -170,12 +173,17 @@ def _with_moving_gain(scene: DynamicScene, view: View, priors: Priors, backend: 
 
 
 def _result(
-    scene: DynamicScene, history: list[dict[str, Tensor]], view: View, backend: str, seconds: float
+    scene: DynamicScene,
+    history: list[dict[str, Tensor]],
+    view: View,
+    held_out: Int[Tensor, " b"],
+    backend: str,
+    seconds: float,
 ) -> FitResult:
     last = history[-max(1, len(history) // 10) :]
     losses = {name: float(torch.stack([step[name] for step in last]).mean()) for name in (last[0] if last else {})}
     frames = torch.linspace(0, len(view.rgb) - 1, min(SCORED_FRAMES, len(view.rgb))).round().long()
-    result = FitResult(scene, losses, psnr(scene, view, frames, backend), len(history), seconds)
+    result = FitResult(scene, losses, psnr(scene, view, frames, backend), len(history), seconds, held_out)
     logger.info(
         "fit: %d + %d Gaussians, %d steps in %.0f s, %.1f dB on the recorded camera",
         len(scene.static),

@@ -14,7 +14,7 @@ from lerobot_msdyn.config import MotionConfig, SceneConfig
 from lerobot_msdyn.episode import View
 from lerobot_msdyn.geometry import project, quaternion_multiply, transform_points
 from lerobot_msdyn.motion.initialise import SceneMotion, scene_motion
-from lerobot_msdyn.motion.register import register_parts
+from lerobot_msdyn.motion.register import Recording
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.scene import DynamicScene, Gaussians, concatenate, isotropic
 
@@ -51,13 +51,10 @@ def initialise(
 
 
 def _motion(view: View, priors: Priors, config: MotionConfig) -> SceneMotion | None:
-    """Motion of everything that was tracked, its parts registered to what was recorded where depth is true."""
-
-    def register(motion: SceneMotion) -> SceneMotion:
-        return register_parts(motion, view.rgb, priors.depth, priors.instances, view.camera)
-
+    """Motion of everything that was tracked, by what was recorded too where depth is true."""
     wanted = config.register and priors.metric
-    return scene_motion(priors.tracks, priors.depth, view.camera, config, register if wanted else None)
+    recording = Recording.of(view.rgb, priors.depth, priors.instances, view.camera) if wanted else None
+    return scene_motion(priors.tracks, priors.depth, view.camera, config, recording)
 
 
 def gather_moving(

@@ -2,7 +2,7 @@
 
 import importlib.metadata
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ class Provenance:
         default_factory=dict
     )  # camera -> prior -> provider, why, model
     views: dict[str, dict[str, Any]] = field(default_factory=dict)  # camera -> its `camera_pose`
+    gate: dict[str, Any] = field(default_factory=dict)  # scores and what was rejected, see docs/quality.md
 
 
 def camera_pose(source: CameraTrack, new: CameraTrack) -> dict[str, Any]:
@@ -68,6 +69,17 @@ def read_unseen(path: Path, camera: str) -> Bool[np.ndarray, "t h w"]:
             return np.unpackbits(file[camera], axis=-1, count=int(file[f"{camera}.width"])).astype(bool)
     except (OSError, ValueError, KeyError) as error:
         raise OutputError(f"{path}: no masks of {camera!r} there ({error}); they are kept with --masks") from error
+
+
+def merged(entries: Sequence[dict[str, dict[str, str]]]) -> dict[str, dict[str, str]]:
+    """What is known about the priors of a video's windows, as one: where they differ, all that was said, in order."""
+    names = dict.fromkeys(name for entry in entries for name in entry)
+    together: dict[str, dict[str, str]] = {}
+    for name in names:
+        found = [entry[name] for entry in entries if name in entry]
+        keys = dict.fromkeys(key for some in found for key in some)
+        together[name] = {key: "; ".join(dict.fromkeys(some[key] for some in found if key in some)) for key in keys}
+    return together
 
 
 def write_provenance(root: Path, episodes: list[Provenance], recipe_yaml: str) -> None:

@@ -10,6 +10,7 @@ from torch import Tensor
 from lerobot_msdyn.cameras import CameraTrack
 from lerobot_msdyn.overlay import FramePatch
 from lerobot_msdyn.render import Raster, rasterize
+from lerobot_msdyn.render.threads import torch_on_one_thread
 from lerobot_msdyn.scene import DynamicScene, Snapshot, patched
 
 
@@ -36,7 +37,7 @@ def draw(
     `extra` is a value per moving Gaussian to be drawn as well; overlays have one of 1.
     """
     if scene.overlay is None:
-        return _rasterized(_snapshot(scene, camera, frames, extra), camera, backend)
+        return _rasterized(_snapshot(scene, camera, frames, extra), camera, scene.near, backend)
     own = len(scene.static) + len(scene.moving)
     drawn = [
         draw_patched(scene, camera.select([i]), frame, scene.overlay.patch(frame, own), backend, extra)
@@ -56,7 +57,7 @@ def draw_patched(
 ) -> Rendering:
     """The scene at one frame through one pose, with a patch in place of what the patch hides."""
     snapshot = _snapshot(scene, camera, torch.tensor([frame]), extra)
-    return _rasterized(patched(snapshot, patch), camera, backend)
+    return _rasterized(patched(snapshot, patch), camera, scene.near, backend)
 
 
 def _snapshot(scene: DynamicScene, camera: CameraTrack, frames: Tensor, extra: Float[Tensor, " m"] | None) -> Snapshot:
@@ -66,7 +67,7 @@ def _snapshot(scene: DynamicScene, camera: CameraTrack, frames: Tensor, extra: F
     return replace(snapshot, extra=torch.cat((torch.zeros(len(scene.static)), extra)))
 
 
-def _rasterized(snapshot: Snapshot, camera: CameraTrack, backend: str) -> Rendering:
+def _rasterized(snapshot: Snapshot, camera: CameraTrack, near: float, backend: str) -> Rendering:
     values = [snapshot.moving] if snapshot.extra is None else [snapshot.moving, snapshot.extra]
     raster: Raster = rasterize(
         snapshot.means,
@@ -78,6 +79,7 @@ def _rasterized(snapshot: Snapshot, camera: CameraTrack, backend: str) -> Render
         camera.intrinsics,
         camera.width,
         camera.height,
+        near=near,
         backend=backend,
     )
     rgb, moving, *more = raster.features.split([3] + [1] * len(values), dim=-1)
@@ -98,4 +100,6 @@ def render_frames(
     frames = torch.arange(scene.frames) if frames is None else frames
     for start in range(0, len(frames), batch):
         part = slice(start, min(start + batch, len(frames)))
-        yield draw(scene, camera.select(part), frames[part], backend, extra)
+        with torch_on_one_thread():
+            drawn = draw(scene, camera.select(part), frames[part], backend, extra)
+        yield drawn

@@ -23,6 +23,7 @@ LEVEL_KINDS: dict[str, type] = {"bases": MotionLevel, "field": DeformationField}
 PATCH_OPACITY = 0.95  # of an overlay's Gaussians
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic
 SH_C1 = 0.4886025119029199  # of the three linear ones
+_SMALLEST_M = 1e-9  # standard deviation: far below any surface's, also where depth is of a wrong scale
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,7 @@ def gaussians_from_points(
     return Gaussians(
         means=means.contiguous(),
         quats=quats.contiguous(),
-        log_scales=scales.clamp(min=1e-6).log(),
+        log_scales=scales.clamp(min=_SMALLEST_M).log(),
         opacity_logits=logit.expand(len(means)).clone(),
         sh=rgb_to_sh(rgb),
     )
@@ -131,6 +132,7 @@ class DynamicScene:
     logits: tuple[Float[Tensor, "n _"], ...]  # per level: their weights before the softmax
     frames: int
     shading: Shading | None = None  # none: brightness does not change
+    near: float = 0.01  # m; nothing that is as near to a camera is drawn
     overlay: Overlay | None = None  # none: nothing is shown as it was recorded
 
     def at(self, frames: Int[Tensor, " b"], eye: Float[Tensor, "b 3"] | None = None) -> Snapshot:
@@ -199,6 +201,7 @@ def save_scene(scene: DynamicScene, path: Path) -> None:
         "schema": SCHEMA_VERSION,
         "levels": [names[type(level)] for level in scene.levels],
         "frames": scene.frames,
+        "near": scene.near,
     }
     partial = path.with_name(path.name + ".partial")
     save_file(
@@ -237,6 +240,7 @@ def load_scene(path: Path) -> DynamicScene:
             logits=tuple(tensors[f"levels.{i}.logits"] for i in range(len(kinds))),
             frames=header["frames"],
             shading=Shading(**part("shading", Shading)) if "shading.field" in tensors else None,
+            near=header["near"],
             overlay=Overlay(**part("overlay", Overlay)) if "overlay.first" in tensors else None,
         )
     except KeyError as error:

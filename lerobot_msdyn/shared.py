@@ -2,19 +2,19 @@
 
 import logging
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from lerobot_msdyn.background import MARGIN_PX, EmptyScene, empty_scene
+from lerobot_msdyn.background import MARGIN_PX, SAMPLES, EmptyScene, empty_scene
 from lerobot_msdyn.cameras import CameraTrack
 from lerobot_msdyn.episode import View
-from lerobot_msdyn.priors.change import changes
 from lerobot_msdyn.priors.edges import clean_recorded_depth
 from lerobot_msdyn.priors.masks import temporal_median
 from lerobot_msdyn.scene import Gaussians, rgb_to_sh
@@ -25,9 +25,13 @@ MAX_EPISODES = 8  # that are looked at
 FRAMES_EACH = 20
 MAX_SHIFT_PX = 1.0  # of a camera between episodes that still count as seen by the same
 SURE_FRAMES = 3  # in which a pixel of the pooled episodes must be seen to count
+WEAK_SHARE = 0.25  # of the frames; seen in fewer, a pixel of an episode's empty scene yields to the others
 ALIKE_GREY_LEVELS = 12.0  # difference up to which two pictures show the same
 ALIKE_DEPTH = 0.02  # relative difference up to which depths are of one surface
 AFFINE_ROUNDS = 3
+
+# (number of a view, frames of all views beside it) -> what moves in it, 0 = nothing
+MovingIn = Callable[[int, UInt8[Tensor, "m h w 3"]], UInt8[Tensor, "t h w"]]
 
 
 @dataclass(frozen=True)
@@ -47,54 +51,74 @@ class SharedBackground:
         same = torch.equal(camera.intrinsics[0], self.camera.intrinsics[0]) and torch.equal(
             camera.world_from_camera[0], self.camera.world_from_camera[0]
         )
-        picture = temporal_median(view.rgb[_spread(len(view.rgb))])[0]
+        picture = temporal_median(view.rgb[few(len(view.rgb))])[0]
         return same and shift_px(picture.numpy(), self.empty.rgb.numpy()) < MAX_SHIFT_PX
 
 
-def share_backgrounds(views: list[View]) -> list[SharedBackground]:
-    """One background per place in which a camera stood, from videos of several episodes; those alone are left out.
+def same_places(views: list[View]) -> list[list[int]]:
+    """Numbers of the videos that were taken from the same place, a list for each; those that are alone are left out.
 
     Videos of moving cameras are left out as well.
     """
-    groups: list[list[View]] = []
+    groups: list[list[int]] = []
     pictures: list[UInt8[ndarray, "h w 3"]] = []
-    for view in views:
+    for number, view in enumerate(views):
         if not view.camera.is_static:
             continue
         picture = temporal_median(view.rgb)[0].numpy()
         shifts = [shift_px(picture, other) for other in pictures]
         if shifts and min(shifts) < MAX_SHIFT_PX:
-            groups[int(np.argmin(shifts))].append(view)
+            groups[int(np.argmin(shifts))].append(number)
         else:
-            groups.append([view])
+            groups.append([number])
             pictures.append(picture)
-    return [_shared(group) for group in groups if len(group) > 1]
+    return [group for group in groups if len(group) > 1]
 
 
-def _shared(views: list[View]) -> SharedBackground:
+def pooled(views: list[View], numbers: list[int], moving: MovingIn) -> SharedBackground:
+    """What some frames of several videos from one place show together.
+
+    `moving` is asked what moves in the frames of each view, by its number, and given the frames of all of them.
+    """
     frames = torch.cat([view.rgb for view in views])
-    return SharedBackground(_pooled(views, frames), views[0].camera.select([0]), frames)
+    depths: list[Float[Tensor, "t h w"]] = []
+    for view in views:
+        unknown = torch.zeros(view.rgb.shape[:3])
+        depths.append(unknown if view.depth is None else clean_recorded_depth(view.depth, *view.depth_range))
+    instances = torch.cat([moving(number, frames) for number in numbers])
+    return SharedBackground(empty_scene(frames, torch.cat(depths), instances), views[0].camera.select([0]), frames)
 
 
 def few_frames(view: View) -> View:
     """Some evenly spread frames of a video."""
-    some = _spread(len(view.rgb))
+    some = few(len(view.rgb))
     depth = None if view.depth is None else view.depth[some]
     return View(view.rgb[some], view.camera.select(some), depth, view.depth_range)
 
 
-def completed(own: EmptyScene, shared: EmptyScene) -> EmptyScene:
-    """An episode's empty scene, with what it never shows taken from the shared one, in the episode's own colours."""
-    take = (own.seen == 0) & (shared.seen >= SURE_FRAMES)
+def completed(own: EmptyScene, shared: EmptyScene, frames: int) -> EmptyScene:
+    """An episode's empty scene, with what it hardly shows taken from the shared one, in the episode's own colours.
+
+    What it never shows, and what it shows otherwise but in few of its `frames`: there the masks are more often wrong.
+    """
+    colours = colour_match(shared, own).applied(shared.rgb)
+    weak = own.seen < WEAK_SHARE * min(frames, SAMPLES)
+    take = (shared.seen >= SURE_FRAMES) & ((own.seen == 0) | (weak & _differs(colours, shared, own)))
     if not bool(take.any()):
         return own
-    colours = colour_match(shared, own).applied(shared.rgb)
     logger.info("%.1f %% of the background taken from other episodes", 100 * float(take.float().mean()))
     return EmptyScene(
         torch.where(take[..., None], colours, own.rgb),
         torch.where(take & (shared.depth > 0), shared.depth, own.depth),
         torch.where(take, shared.seen, own.seen),
     )
+
+
+def _differs(colours: UInt8[Tensor, "h w 3"], shared: EmptyScene, own: EmptyScene) -> Bool[Tensor, "h w"]:
+    """Where a shared empty scene, in an episode's `colours`, shows another surface than the episode's."""
+    colour = (colours.int() - own.rgb.int()).abs().amax(-1) > ALIKE_GREY_LEVELS
+    depth = (shared.depth - own.depth).abs() > ALIKE_DEPTH * own.depth
+    return colour | (depth & (own.depth > 0) & (shared.depth > 0))
 
 
 def adapted(shared: SharedBackground, own: EmptyScene, fresh: Gaussians) -> Gaussians:
@@ -108,11 +132,10 @@ def adapted(shared: SharedBackground, own: EmptyScene, fresh: Gaussians) -> Gaus
     assert shared.static is not None
     match = colour_match(shared.empty, own)
     grid = round(math.sqrt(own.seen.numel() / len(fresh)))
-    colour = (match.applied(shared.empty.rgb).int() - own.rgb.int()).abs().amax(-1) > ALIKE_GREY_LEVELS
-    depth = (shared.empty.depth - own.depth).abs() > ALIKE_DEPTH * own.depth
-    unsure = (shared.empty.seen < SURE_FRAMES) | (depth & (own.depth > 0))
+    mine = (shared.empty.seen < SURE_FRAMES) | ((own.depth > 0) & (shared.empty.depth == 0))
+    mine |= _differs(match.applied(shared.empty.rgb), shared.empty, own)
     window = np.ones((2 * MARGIN_PX + 1,) * 2, np.uint8)
-    differs = torch.from_numpy(cv2.dilate((colour | unsure).numpy().astype(np.uint8), window) > 0)
+    differs = torch.from_numpy(cv2.dilate(mine.numpy().astype(np.uint8), window) > 0)
     rows = differs[grid // 2 :: grid, grid // 2 :: grid].reshape(-1)
     logger.info("%.1f %% of the shared background is another in this episode", 100 * float(rows.float().mean()))
     rgb = shared.static.rgb * match.factor + match.offset / 255
@@ -166,16 +189,24 @@ def shift_px(picture: UInt8[ndarray, "h w 3"], other: UInt8[ndarray, "i j 3"]) -
     return float(np.hypot(dx, dy))
 
 
-def _pooled(views: list[View], rgb: UInt8[Tensor, "m h w 3"]) -> EmptyScene:
-    """The empty scene over some frames of every video; what differs from the median of all of them moves."""
-    median, noise = temporal_median(rgb)
-    moving = torch.from_numpy(changes(rgb.numpy(), median.numpy(), noise.numpy()).astype(np.uint8))
-    depths: list[Float[Tensor, "t h w"]] = []
-    for view in views:
-        unknown = torch.zeros(view.rgb.shape[:3])
-        depths.append(unknown if view.depth is None else clean_recorded_depth(view.depth, *view.depth_range))
-    return empty_scene(rgb, torch.cat(depths), moving)
+def as_arrays(background: SharedBackground) -> dict[str, ndarray]:
+    """A background for a file, without its frames and camera."""
+    tensors = dict(vars(background.empty))
+    if background.static is not None:
+        tensors |= {f"static.{name}": tensor for name, tensor in vars(background.static).items()}
+    return {name: tensor.numpy() for name, tensor in tensors.items()}
 
 
-def _spread(frames: int) -> list[int]:
+def from_arrays(arrays: dict[str, ndarray], camera: CameraTrack, frames: UInt8[Tensor, "m h w 3"]) -> SharedBackground:
+    """What `as_arrays` gave, with its frames and camera."""
+    tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
+    empty = EmptyScene(*(tensors[item.name] for item in fields(EmptyScene)))
+    if "static.means" not in tensors:
+        return SharedBackground(empty, camera, frames)
+    static = Gaussians(*(tensors[f"static.{item.name}"] for item in fields(Gaussians)))
+    return SharedBackground(empty, camera, frames, static)
+
+
+def few(frames: int) -> list[int]:
+    """Evenly spread frames of a video of so many."""
     return sorted(set(np.linspace(0, frames - 1, min(frames, FRAMES_EACH)).round().astype(int).tolist()))

@@ -14,6 +14,8 @@ from lerobot_msdyn.config import Fill, Recipe
 from lerobot_msdyn.coverage import Coverage, Evidence, coverage_of
 from lerobot_msdyn.filling import filled, missing
 from lerobot_msdyn.fitting import FitResult
+from lerobot_msdyn.quality.verdict import Witnessed
+from lerobot_msdyn.quality.witness import Witness
 from lerobot_msdyn.rendering import Rendering, render_frames
 from lerobot_msdyn.scene import DynamicScene
 
@@ -26,11 +28,18 @@ class Reconstruction:
 
     results: tuple[FitResult, ...]
     starts: tuple[int, ...]  # first frame of each window
-    metric: bool  # whether depth is in true metres
-    provenance: dict[str, dict[str, str]]  # prior -> provider, why, model and licence, of the first window
+    metric: bool  # whether depth is in true metres, in all windows
+    provenance: dict[str, dict[str, str]]  # prior -> provider, why, model and licence, of all windows
     camera: CameraTrack  # at the size of the recorded video
     distance: float  # m, to the look-at point
     evidence: tuple[Evidence, ...]  # what the recorded camera showed in each window
+    witnesses: tuple[Witness, ...]  # how well each window's scene explains its own video
+
+    @property
+    def windows(self) -> list[Witnessed]:
+        """What a new view is judged by."""
+        parts = zip(self.results, self.evidence, self.witnesses, self.starts, strict=True)
+        return [Witnessed(result.scene, seen, witness, start) for result, seen, witness, start in parts]
 
     @property
     def seconds(self) -> float:

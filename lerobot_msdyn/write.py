@@ -46,6 +46,7 @@ class NewEpisode:
     provenance: Provenance
     pictures: StagedPictures = field(default_factory=StagedPictures)  # none for a copy of the source's episode
     masks: Mapping[str, np.ndarray] = field(default_factory=dict)  # of what was never seen, see `write_unseen`
+    dropped: str = ""  # why there is no such episode in the end: the gate's reason
 
 
 class OutputDataset:

@@ -1,16 +1,21 @@
 """The benchmark of motion: its short run, and what its figures rest on."""
 
+import dataclasses
 import importlib
 import json
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 import torch
 
+from lerobot_msdyn.config import Recipe
+from lerobot_msdyn.episode import View
 from lerobot_msdyn.geometry import axis_angle_to_matrix, se3
 from lerobot_msdyn.motion.compose import compose
+from lerobot_msdyn.synthetic import make_scene
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 
@@ -77,3 +82,37 @@ def test_true_points_on_the_cloth_are_carried_as_the_truth_says(simulated: Modul
         error = (carried - episode.xyz[rows]).norm(dim=-1)
         assert error.mean() < 1e-4
         assert error.max() < 5e-3
+
+
+def test_the_figures_of_the_gates_benchmark(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    gate = importlib.import_module("gate")
+    row = gate.Row("push", "none", "az", 20.0, 21.0, 0.9, 0.91, 0.5)
+    rows = [dataclasses.replace(row, score_db=20.0 + i, true_db=15.0 + i) for i in range(10)]
+    found = gate.summary(rows)
+    assert (found["cases"], found["spearman"], found["coverage_error_points"]) == (10, 1.0, 1.0)
+    assert (found["bad_views"], found["caught_share"], found["bias_db"]) == (5, 0.4, 5.0)
+
+
+def test_corruptions_are_what_they_are_called(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    corruptions = importlib.import_module("corruptions")
+    rng = np.random.default_rng(0)
+    depth = np.full((6, 24, 32), 0.7, np.float32)
+    wrong = np.abs(np.log(corruptions.wrong_depth(depth, rng) / depth))
+    assert 0.01 < wrong.mean() < 0.15
+    masks = np.zeros((40, 24, 32), np.uint8)
+    masks[:, 10:14, 10:14] = 3
+    broken = corruptions.broken_masks(masks, rng)
+    assert 0.2 < (broken.sum((1, 2)) == 0).mean() < 0.6
+    assert set(np.unique(broken)) == {0, 3}
+    scene = make_scene("push", 0, 12, 64, 48)
+    seen = scene.render(scene.camera)
+    view, recipe = View(seen.rgb, scene.camera, seen.depth), Recipe()
+    priors = corruptions.clean_priors(view, recipe)
+    for name in corruptions.CORRUPTIONS:
+        case = corruptions.corrupted(view, recipe, name, priors, tmp_path)
+        assert case.recipe.priors.masks.endswith(f"{name}.npz")
+        assert case.recipe.priors.depth == ("auto" if name != "wrong_depth" else case.recipe.priors.masks)
+        assert (case.recipe.fit.steps == 1) == (name == "too_few_steps")
+    assert recipe == Recipe()

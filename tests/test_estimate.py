@@ -25,5 +25,5 @@ def test_parts_are_added_up(desk: Path) -> None:
     speeds = Speeds(read_s=1.0, prepare_s=2.0, step_s=3.0, render_s=4.0)
     assert predicted_seconds(speeds, source, [0, 2], recipe) == pytest.approx(2 * (12 * (1 + 2 + 2 * 4) + 2 * 100 * 3))
     recipe.scene.shared_background = True
-    shared = 3 * 12 * 1 + 50 * 3 + 2 * (12 * (1 + 2 + 2 * 4) + 2 * 60 * 3)
+    shared = 2 * 3 * 12 * 1 + 12 * 0.3 * 2 + 50 * 3 + 2 * (12 * (1 + 2 + 2 * 4) + 2 * 60 * 3)
     assert predicted_seconds(speeds, source, [0, 2], recipe) == pytest.approx(shared)

@@ -31,7 +31,7 @@ def still_video() -> tuple[View, Priors]:
         torch.zeros(0, dtype=torch.long),
     )
     instances = torch.zeros(FRAMES, HEIGHT, WIDTH, dtype=torch.uint8)
-    return View(rgb, camera), Priors(torch.ones(FRAMES, HEIGHT, WIDTH), instances, rgb[0], nothing, metric=True)
+    return View(rgb, camera), Priors(torch.ones(FRAMES, HEIGHT, WIDTH), instances, nothing, metric=True)
 
 
 def grey_scene(view: View) -> DynamicScene:
@@ -48,7 +48,7 @@ def run(steps: int, seed: int = 0) -> tuple[DynamicScene, FitResult]:
     scene = grey_scene(view)
     config = FitConfig(steps=steps)
     config.learning_rates.colours = 0.1
-    return scene, fit(scene, view, priors, config, distance=1.0, seed=seed)
+    return scene, fit(scene, view, priors, config, empty=view.rgb[0], distance=1.0, seed=seed)
 
 
 def test_the_fit_gets_closer_to_the_recorded_pictures() -> None:
@@ -83,7 +83,16 @@ def test_no_steps_at_all() -> None:
 def test_progress_is_reported_step_by_step() -> None:
     view, priors = still_video()
     seen: list[int] = []
-    fit(grey_scene(view), view, priors, FitConfig(steps=4), distance=1.0, seed=0, progress=seen.append)
+    fit(
+        grey_scene(view),
+        view,
+        priors,
+        FitConfig(steps=4),
+        empty=view.rgb[0],
+        distance=1.0,
+        seed=0,
+        progress=seen.append,
+    )
     assert seen == [1, 1, 1, 1]
 
 
@@ -92,7 +101,7 @@ def test_a_weight_of_zero_switches_a_term_off() -> None:
     config = FitConfig(steps=5)
     config.weights.rgb, config.weights.depth, config.weights.mask = 0.0, 0.0, 0.0
     scene = grey_scene(view)
-    result = fit(scene, view, priors, config, distance=1.0, seed=0)
+    result = fit(scene, view, priors, config, empty=view.rgb[0], distance=1.0, seed=0)
     assert torch.equal(result.scene.static.sh, scene.static.sh)
 
 
@@ -105,6 +114,7 @@ def test_unknown_depth_is_no_obstacle(gone: str) -> None:
         view,
         dataclasses.replace(priors, depth=depth),
         FitConfig(steps=3),
+        empty=view.rgb[0],
         distance=1.0,
         seed=0,
     )
@@ -121,7 +131,7 @@ def test_the_fit_stops_when_held_out_frames_no_longer_improve() -> None:
     scene = dataclasses.replace(grey_scene(view), frames=12, levels=(identity_level(torch.zeros(1, 3), 12),))
     config.learning_rates = LearningRates(0.0, 0.0, 0.0, 0.0, 0.0)  # nothing ever improves
     seen: list[int] = []
-    result = fit(scene, many, known, config, distance=1.0, seed=0, progress=seen.append)
+    result = fit(scene, many, known, config, empty=view.rgb[0], distance=1.0, seed=0, progress=seen.append)
     assert result.steps == 100
     assert sum(seen) == 400
 
@@ -132,4 +142,4 @@ def test_numbers_that_are_not_finite_end_the_fit() -> None:
     config = FitConfig(steps=3)
     config.weights.rgb = float("inf")
     with pytest.raises(EpisodeError, match="diverged at step 0, frame"):
-        fit(scene, view, priors, config, distance=1.0, seed=0)
+        fit(scene, view, priors, config, empty=view.rgb[0], distance=1.0, seed=0)

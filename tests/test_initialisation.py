@@ -27,11 +27,9 @@ def pushed() -> tuple[View, Priors]:
     scene = make_scene("push", 0, FRAMES, WIDTH, HEIGHT)
     seen = scene.render(scene.camera)
     tracks = scene.tracks(600)
-    empty = torch.where(seen.instances[..., None] > 0, torch.nan, seen.rgb.float()).nanmedian(0).values
     priors = Priors(
         seen.depth,
         seen.instances,
-        empty.nan_to_num(0).to(torch.uint8),
         PointTracks(tracks.xy, tracks.visible, tracks.visible.float(), tracks.instance),
         metric=True,
     )
@@ -136,7 +134,7 @@ def test_points_in_front_of_what_stands_still_are_contradicted() -> None:
     nothing = PointTracks(
         torch.zeros(0, 4, 2), torch.zeros(0, 4, dtype=torch.bool), torch.zeros(0, 4), torch.zeros(0, dtype=torch.long)
     )
-    priors = Priors(depth, instances, view.rgb[0], nothing, metric=True)
+    priors = Priors(depth, instances, nothing, metric=True)
     xy = torch.tensor([[15.0, 15.0], [30.0, 15.0], [30.0, 15.0], [-9.0, 15.0]])
     z = torch.tensor([0.9, 0.9, 1.1, 0.9])  # on the mask; in front of the wall; behind it; outside the image
     points = unproject(xy, z, camera.intrinsics[0])

@@ -1,13 +1,16 @@
 """From a video to its scenes and new pictures, also where the video is not as one would wish."""
 
 import dataclasses
+from typing import Any
 
 import pytest
 import torch
 
+from lerobot_msdyn import pipeline
 from lerobot_msdyn.config import Recipe
 from lerobot_msdyn.episode import View
 from lerobot_msdyn.pipeline import new_pictures, reconstruct
+from lerobot_msdyn.priors import Priors, estimate_priors
 from lerobot_msdyn.synthetic import make_scene
 
 FRAMES, WIDTH, HEIGHT = 12, 64, 48
@@ -74,10 +77,49 @@ def test_a_cut(pushed: View) -> None:
     assert len(pictures) == FRAMES
 
 
-@pytest.mark.parametrize("scale", [0.1, 30.0])
+@pytest.mark.parametrize("scale", [0.01, 0.1, 30.0])
 def test_depth_of_the_wrong_scale(pushed: View, scale: float) -> None:
     assert pushed.depth is not None
     check(dataclasses.replace(pushed, depth=pushed.depth * scale), recipe())
+
+
+def test_unmeasured_depth(pushed: View) -> None:
+    assert pushed.depth is not None
+    depth = pushed.depth.clone()
+    depth[2:5] = torch.nan
+    depth[7, :20] = torch.inf
+    depth[9] = 0
+    check(dataclasses.replace(pushed, depth=depth), recipe())
+
+
+@pytest.mark.parametrize("lost", ["from the middle on", "at every other frame", "all"])
+def test_lost_tracks(pushed: View, monkeypatch: pytest.MonkeyPatch, lost: str) -> None:
+    def estimated(*arguments: Any, **named: Any) -> Priors:
+        priors = estimate_priors(*arguments, **named)
+        visible = priors.tracks.visible.clone()
+        gone = {"from the middle on": slice(FRAMES // 2, None), "at every other frame": slice(0, None, 2)}
+        visible[:, gone.get(lost, slice(None))] = False
+        return dataclasses.replace(priors, tracks=dataclasses.replace(priors.tracks, visible=visible))
+
+    monkeypatch.setattr(pipeline, "estimate_priors", estimated)
+    check(pushed, recipe())
+
+
+def test_windows_whose_priors_differ_say_so(pushed: View, monkeypatch: pytest.MonkeyPatch) -> None:
+    known = iter([True, False])
+
+    def estimated(*arguments: Any, **named: Any) -> Priors:
+        priors, metric = estimate_priors(*arguments, **named), next(known)
+        depth = {"provider": "recorded" if metric else "plane", "why": "of this test"}
+        return dataclasses.replace(priors, metric=metric, provenance=priors.provenance | {"depth": depth})
+
+    monkeypatch.setattr(pipeline, "estimate_priors", estimated)
+    settings = recipe()
+    settings.fit.window_frames = 6
+    found = reconstruct(pushed, settings)
+    assert found.provenance["depth"] == {"provider": "recorded; plane", "why": "of this test"}
+    assert found.provenance["masks"]["provider"] == "change"
+    assert not found.metric
 
 
 def test_a_long_video_is_fitted_in_windows(pushed: View) -> None:

@@ -112,7 +112,7 @@ def test_all_kinds_of_levels_come_back(tmp_path: Path) -> None:
 
 def test_a_scene_without_some_of_its_arrays_is_named(tmp_path: Path) -> None:
     path = tmp_path / "scene.safetensors"
-    header = '{"schema": 3, "levels": ["bases"], "frames": 3}'
+    header = '{"schema": 3, "near": 0.01, "levels": ["bases"], "frames": 3}'
     save_file({"static.means": torch.zeros(1, 3)}, path, metadata={"lerobot_msdyn": header})
     with pytest.raises(MsdynError, match=r"not a readable scene file .*is missing"):
         load_scene(path)

@@ -9,7 +9,19 @@ import torch
 from lerobot_msdyn.background import EmptyScene, background_gaussians, empty_scene
 from lerobot_msdyn.cameras import intrinsics_from_fov, static_camera
 from lerobot_msdyn.episode import View
-from lerobot_msdyn.shared import adapted, colour_match, completed, few_frames, share_backgrounds, shift_px
+from lerobot_msdyn.shared import (
+    MovingIn,
+    SharedBackground,
+    adapted,
+    as_arrays,
+    colour_match,
+    completed,
+    few_frames,
+    from_arrays,
+    pooled,
+    same_places,
+    shift_px,
+)
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 9
 
@@ -30,9 +42,18 @@ def episode(block_column: int, wall: np.ndarray, shift: int = 0) -> View:
     return View(rgb, camera, depth)
 
 
-def test_what_differs_between_episodes_is_no_background() -> None:
+def moving(views: list[View], wall: np.ndarray) -> MovingIn:
+    """The block."""
+    return lambda number, frames: (views[number].rgb != torch.from_numpy(wall)).any(-1).to(torch.uint8)
+
+
+def shared_by(views: list[View], wall: np.ndarray) -> list[SharedBackground]:
+    return [pooled([views[i] for i in group], group, moving(views, wall)) for group in same_places(views)]
+
+
+def test_what_moves_is_no_background_though_most_episodes_show_it_at_the_same_place() -> None:
     wall = texture()
-    (shared,) = share_backgrounds([episode(column, wall) for column in (4, 20, 36, 52)])
+    (shared,) = shared_by([episode(column, wall) for column in (20, 20, 20, 52)], wall)
     assert (shared.empty.rgb.numpy() == wall).mean() > 0.99
     assert (shared.empty.depth == 2).all()
     assert shared.frames.shape == (4 * FRAMES, HEIGHT, WIDTH, 3)
@@ -48,7 +69,8 @@ def test_a_camera_that_was_moved_has_its_own_background() -> None:
         episode(36, wall, shift=6),
         episode(4, texture(1)),
     ]
-    found = share_backgrounds(views)
+    nothing = torch.zeros(FRAMES, HEIGHT, WIDTH, dtype=torch.uint8)
+    found = [pooled([views[i] for i in group], group, lambda *_: nothing) for group in same_places(views)]
     assert len(found) == 2
     assert [group.fits(views[0]) for group in found] == [True, False]
     assert [group.fits(views[2]) for group in found] == [False, True]
@@ -59,7 +81,7 @@ def test_a_moving_camera_shares_nothing() -> None:
     poses = view.camera.world_from_camera.clone()
     poses[3:, 0, 3] = 0.2
     swaying = dataclasses.replace(view, camera=dataclasses.replace(view.camera, world_from_camera=poses))
-    (shared,) = share_backgrounds([view, episode(20, texture()), swaying, swaying])
+    (shared,) = shared_by([view, episode(20, texture()), swaying, swaying], texture())
     assert not shared.fits(swaying)
 
 
@@ -69,15 +91,27 @@ def test_only_what_an_episode_never_shows_is_taken_from_others_and_in_its_colour
     everywhere = EmptyScene(torch.from_numpy(wall), torch.full((HEIGHT, WIDTH), 2.0), seen)
     darker = torch.from_numpy((0.8 * wall + 10).round().astype(np.uint8))
     hidden = (slice(10, 20), slice(10, 30))
-    own_picture, own_seen, own_depth = darker.clone(), seen.clone(), torch.full((HEIGHT, WIDTH), 2.1)
+    own_picture, own_seen, own_depth = darker.clone(), seen.clone(), torch.full((HEIGHT, WIDTH), 2.02)
     own_picture[hidden], own_seen[hidden], own_depth[hidden] = 0, 0, 0
-    whole = completed(EmptyScene(own_picture, own_depth, own_seen), everywhere)
+    whole = completed(EmptyScene(own_picture, own_depth, own_seen), everywhere, 60)
     assert (whole.rgb.int() - darker.int()).abs().max() <= 1
     assert (whole.depth[hidden] == 2).all()
-    assert (whole.depth == 2.1).sum() == HEIGHT * WIDTH - 200
+    assert (whole.depth == 2.02).sum() == HEIGHT * WIDTH - 200
     assert (whole.seen >= 20).all()
     nothing_missing = EmptyScene(darker, own_depth, seen)
-    assert completed(nothing_missing, everywhere) is nothing_missing
+    assert completed(nothing_missing, everywhere, 60) is nothing_missing
+
+
+def test_what_an_episode_shows_otherwise_counts_only_if_it_does_so_for_long() -> None:
+    wall = texture()
+    place = (slice(10, 20), slice(10, 30))
+    everywhere = EmptyScene(torch.from_numpy(wall), torch.full((HEIGHT, WIDTH), 2.0), torch.full((HEIGHT, WIDTH), 60))
+    for frames, kept in ((5, False), (30, True)):
+        picture, seen = torch.from_numpy(wall).clone(), torch.full((HEIGHT, WIDTH), 60)
+        picture[place], seen[place] = 250, frames
+        found = completed(EmptyScene(picture, everywhere.depth, seen), everywhere, 100)
+        assert torch.equal(found.rgb, picture) == kept
+        assert torch.equal(found.rgb, everywhere.rgb) != kept
 
 
 def test_colours_are_matched_in_spite_of_things_that_differ() -> None:
@@ -91,7 +125,7 @@ def test_colours_are_matched_in_spite_of_things_that_differ() -> None:
 
 def test_an_episode_keeps_its_own_gaussians_where_its_background_is_another() -> None:
     view = episode(4, texture())
-    (shared,) = share_backgrounds([view, episode(20, texture()), episode(40, texture())])
+    (shared,) = shared_by([view, episode(20, texture()), episode(40, texture())], texture())
     static = background_gaussians(shared.empty.rgb, shared.empty.depth, view.camera, 10_000)
     shared = dataclasses.replace(shared, static=dataclasses.replace(static, means=static.means + 1))  # to tell them
     own = empty_scene(view.rgb, view.depth, torch.zeros(FRAMES, HEIGHT, WIDTH, dtype=torch.uint8))
@@ -119,3 +153,15 @@ def test_few_frames_of_a_long_video() -> None:
     )
     assert len(few_frames(long).rgb) == 20
     assert len(few_frames(view).rgb) == FRAMES
+
+
+def test_a_background_comes_back_from_its_arrays() -> None:
+    view = episode(4, texture())
+    (shared,) = shared_by([view, episode(20, texture())], texture())
+    static = background_gaussians(shared.empty.rgb, shared.empty.depth, view.camera, 10_000)
+    for known in (shared, dataclasses.replace(shared, static=static)):
+        again = from_arrays(as_arrays(known), known.camera, known.frames)
+        assert torch.equal(again.empty.rgb, known.empty.rgb)
+        assert (again.static is None) == (known.static is None)
+        if again.static is not None:
+            assert torch.equal(again.static.sh, static.sh)

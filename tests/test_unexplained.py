@@ -41,7 +41,7 @@ def recorded() -> tuple[DynamicScene, View, Priors]:
     moving = pixel_gaussians(rgb[0], depth[0], camera, 0)[0].select((instances[0] > 0).reshape(-1))
     rows = torch.zeros(len(moving), 1)
     scene = DynamicScene(static, moving, (identity_level(torch.zeros(1, 3), FRAMES),), (rows.long(),), (rows,), FRAMES)
-    return scene, View(rgb, camera), Priors(depth, instances, wall, tracks, metric=True)
+    return scene, View(rgb, camera), Priors(depth, instances, tracks, metric=True)
 
 
 def red(scene: DynamicScene, camera: CameraTrack, frame: int) -> torch.Tensor:

@@ -18,16 +18,15 @@ def test_recipes_are_in_the_wheel_and_found_by_name(tmp_path: Path) -> None:
     with zipfile.ZipFile(wheel) as file:
         names = file.namelist()
         file.extractall(tmp_path / "installed")
-    assert "lerobot_msdyn/recipes/quick.yaml" in names
+    assert "lerobot_msdyn/recipe_files/quick.yaml" in names
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert not any(name.startswith(("tests/", "examples/", "recipes/")) for name in names)
+
+    def said(*arguments: str) -> str:
+        where = {"env": {"PYTHONPATH": str(tmp_path / "installed")}, "cwd": tmp_path}
+        return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, check=True, **where).stdout
+
+    listed = [line.split()[0] for line in said("-m", "lerobot_msdyn.recipes", "ls").splitlines()]
+    assert listed == sorted(path.stem for path in (PROJECT / "recipes").glob("*.yaml"))
     code = "from lerobot_msdyn.cli import *; print(recipe_folder(), load_recipe('quick').variants)"
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        check=True,
-        env={"PYTHONPATH": str(tmp_path / "installed")},
-        cwd=tmp_path,
-    )
-    assert done.stdout.split() == [str(tmp_path / "installed" / "lerobot_msdyn" / "recipes"), "1"]
+    assert said("-c", code).split() == [str(tmp_path / "installed" / "lerobot_msdyn" / "recipe_files"), "1"]

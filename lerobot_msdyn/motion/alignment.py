@@ -1,207 +1,196 @@
-"""One frame's depth, picture and masks, and how rigid parts are aligned to them by Gauss-Newton steps."""
+"""What a video shows, points gathered from it, and how rigid parts are aligned to it by Gauss-Newton steps."""
 
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from lerobot_msdyn.cameras import CameraTrack
-from lerobot_msdyn.geometry import axis_angle_to_matrix, project, se3, transform_points, unproject
+from lerobot_msdyn.geometry import invert_se3, transform_points, unproject
+from lerobot_msdyn.motion.kernels import OUTSIDE_UNIT, REACH_PX, Maps, Points, align_poses, frame_costs
 from lerobot_msdyn.motion.lift import near_depth_edge
 
-_SLOPE_REACH_PX = 2  # to either side, over which normals are taken, and 1 for gradients
-_STEPS = 2
+_BORDER_PX = 2  # of the masks, without points
+_STEPS = 2  # of Gauss-Newton
 _LONGEST_STEP_PX = 3.0
-_BEHIND_PX = 8.0  # a point farther than this from the recorded surface is hidden, or the surface is another one
-_IN_FRONT_PX = 3.0  # a point no farther than this behind what stands still should have been seen
-_FACING = 0.2  # least cosine between a normal and the view
-_ALIKE = 0.5  # least cosine between the normals of a point and of the surface that it meets
-_OUTLINE_PX = 8.0  # farther outside the masks a point tells nothing
-_SIGMAS = (0.5, 8.0, 1.0)  # px of depth, grey levels, px outside the masks
-_OUTLIER = 3.0  # sigmas at which three quarters of the weight are lost (Geman-McClure)
-_CORRELATED = 8.0  # neighbouring points, which err alike and count as one
 _TRACKS_SIGMA_PX = 5.0  # error of motions that come from tracks
+_LEAST_REACH_M = 1e-3
 
 
 @dataclass(frozen=True)
-class Frame:
-    """What one frame shows."""
+class Video:
+    """The maps of all frames, and the camera that saw them."""
 
-    depth: Float[Tensor, "h w"]  # m
-    known: Bool[Tensor, "h w"]  # where depth and normals can be relied on
-    grey: Float[Tensor, "h w"]  # 0..255
-    outside: Float[Tensor, "h w"]  # px to the nearest moving pixel
-    instances: UInt8[Tensor, "h w"]
-    camera: CameraTrack  # one frame
-    pixel_m: float  # size of a pixel where things move
+    maps: Maps
+    instances: UInt8[Tensor, "t h w"]
+    camera: CameraTrack
 
-    def xyz(self, row: Int[Tensor, " n"], column: Int[Tensor, " n"]) -> Float[Tensor, "n 3"]:
-        """World points (m) of some pixels."""
-        xy = torch.stack((column, row), dim=-1) + 0.5
-        points = unproject(xy, self.depth[row, column], self.camera.intrinsics[0])
-        return transform_points(self.camera.world_from_camera[0], points)
+    def __len__(self) -> int:
+        return len(self.instances)
 
-    def normals(self, row: Int[Tensor, " n"], column: Int[Tensor, " n"]) -> Float[Tensor, "n 3"]:
-        """Unit normals in the world, towards the camera."""
-        (left, right), (up, down) = _beside(self.depth, row, column, _SLOPE_REACH_PX)
-        across = self.xyz(row, right) - self.xyz(row, left)
-        return torch.nn.functional.normalize(
-            torch.linalg.cross(self.xyz(down, column) - self.xyz(up, column), across), dim=-1
-        )
+    @property
+    def pixel_m(self) -> float:
+        """Size of a pixel (m) where things move."""
+        return self.maps.pixel_m
 
 
 @dataclass(frozen=True)
-class Model:
-    """Points of the parts at the canonical frame."""
+class Sightings:
+    """Points of what moves, each as one frame shows it."""
 
-    points: Float[Tensor, "n 3"]  # m
-    normals: Float[Tensor, "n 3"]
-    grey: Float[Tensor, " n"]
-    part: Int[Tensor, " n"]
+    xyz: Float[Tensor, "n 3"]  # m, in the world
+    normals: Float[Tensor, "n 3"]  # towards the camera
+    grey: Float[Tensor, " n"]  # 0..255
+    frame: Int[Tensor, " n"]
+    instance: Int[Tensor, " n"]
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def at_canonical(
+        self, motions: Float[Tensor, "k t 4 4"], part: Int[Tensor, " n"]
+    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+        """Points (m) and normals carried back by the motions of their parts."""
+        back = invert_se3(motions[part, self.frame])
+        points = transform_points(back, self.xyz[:, None].to(back))[:, 0]
+        return points, (back[:, :3, :3] @ self.normals[..., None].to(back))[..., 0]
 
 
-@dataclass(frozen=True)
-class Terms:
-    """Residuals of depth, colour and outline, in standard deviations."""
-
-    residuals: Float[Tensor, "3 n"]
-    weights: Float[Tensor, "3 n"]  # robust; 0 where there is nothing to compare with
-    gradients: Float[Tensor, "3 n 3"]  # by the point in the world, per m
-    points: Float[Tensor, "n 3"]  # m, in the world
-
-
-def read_frame(
-    rgb: UInt8[Tensor, "h w 3"],
-    depth: Float[Tensor, "h w"],
-    instances: UInt8[Tensor, "h w"],
+def read_video(
+    rgb: UInt8[Tensor, "t h w 3"],
+    depth: Float[Tensor, "t h w"],
+    instances: UInt8[Tensor, "t h w"],
     camera: CameraTrack,
     pixel_m: float,
-) -> Frame:
-    """The maps of one frame."""
-    side = 2 * _SLOPE_REACH_PX + 1
-    known = cv2.erode((depth > 0).numpy().astype(np.uint8), np.ones((side, side), np.uint8)) > 0
-    grey = cv2.GaussianBlur(cv2.cvtColor(rgb.numpy(), cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1.0)
-    outside = cv2.distanceTransform((instances == 0).numpy().astype(np.uint8), cv2.DIST_L2, 5)
-    reliable = torch.from_numpy(known & ~near_depth_edge(depth.numpy()))
-    return Frame(depth, reliable, torch.from_numpy(grey), torch.from_numpy(outside), instances, camera, pixel_m)
+) -> Video:
+    """The maps of a video: depth in m (0 = unknown), instances (0 = what stands still)."""
+    known, outside = np.zeros(depth.shape, bool), np.zeros(depth.shape, np.uint8)
+    grey = np.zeros(depth.shape, np.uint8)
+    window = np.ones((2 * REACH_PX + 1,) * 2, np.uint8)
+    for t, (picture, z, labels) in enumerate(zip(rgb.numpy(), depth.numpy(), instances.numpy(), strict=True)):
+        known[t] = (cv2.erode((z > 0).astype(np.uint8), window) > 0) & ~near_depth_edge(z)
+        grey[t] = cv2.GaussianBlur(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (0, 0), 1.0)
+        distance = cv2.distanceTransform((labels == 0).astype(np.uint8), cv2.DIST_L2, 5)
+        outside[t] = np.minimum(distance * OUTSIDE_UNIT, 255)
+    maps = Maps(depth.numpy(), known, grey, outside, camera.intrinsics.float().contiguous().numpy(), pixel_m)
+    return Video(maps, instances, camera)
 
 
-def compare(model: Model, motions: Float[Tensor, "k 4 4"], frame: Frame) -> Terms:
-    """A model, moved to a frame, against what is seen there.
-
-    Depth: distance from the recorded surface along its normal (point to plane, Chen and Medioni 1992), by projection.
-    Colour: grey, but for the part's mean difference. Outline: distance outside the masks, of points which nothing that
-    stands still can hide.
-    """
-    moves = motions[model.part]
-    points = transform_points(moves, model.points[:, None])[:, 0]
-    normals = (moves[:, :3, :3] @ model.normals[..., None])[..., 0]
-    view = frame.camera.camera_from_world[0]
-    in_camera = transform_points(view, points)
-    xy, z = project(in_camera, frame.camera.intrinsics[0])
-    height, width = frame.depth.shape
-    column, row = xy.floor().long().unbind(-1)
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (z > 0)
-    column, row = column.clamp(0, width - 1), row.clamp(0, height - 1)
-    away = points - frame.camera.world_from_camera[0, :3, 3]
-    shown = inside & (-(away * normals).sum(-1) > _FACING * away.norm(dim=-1))
-
-    surface, surface_normals = frame.xyz(row, column), frame.normals(row, column)
-    offset = points - surface
-    moving = frame.instances[row, column] > 0
-    met = shown & moving & frame.known[row, column] & ((surface_normals * normals).sum(-1) > _ALIKE)
-    met &= offset.norm(dim=-1) < _BEHIND_PX * frame.pixel_m
-    recorded = frame.depth[row, column]
-    outside = frame.outside[row, column]
-    in_front = (z < recorded + _IN_FRONT_PX * frame.pixel_m) | (recorded == 0)
-    stray = shown & ~moving & in_front & (outside < _OUTLINE_PX)
-
-    slope = _slope(frame.grey, row, column)
-    within = xy - torch.stack((column, row), dim=-1) - 0.5
-    grey = frame.grey[row, column] + (slope * within).sum(-1) - model.grey
-    count = torch.zeros(len(motions)).index_add_(0, model.part, met.float()).clamp(min=1)
-    mean = torch.zeros(len(motions)).index_add_(0, model.part, met * grey) / count
-    depth_sigma = _SIGMAS[0] * frame.pixel_m
-    residuals = torch.stack(
-        (
-            (surface_normals * offset).sum(-1) / depth_sigma,
-            (grey - mean[model.part]) / _SIGMAS[1],
-            outside / _SIGMAS[2],
-        )
-    )
-    robust = 1 / (1 + (residuals / _OUTLIER).square()).square()
-    robust[2] = 1
-    lines = torch.stack((slope / _SIGMAS[1], _slope(frame.outside, row, column) / _SIGMAS[2]))
-    gradients = torch.cat(((surface_normals / depth_sigma)[None], _by_point(lines, in_camera, frame)))
-    return Terms(residuals, robust * torch.stack((met, met, stray)), gradients, points)
+def sight(video: Video, frames: list[int], most: int) -> Sightings:
+    """Points of some frames, `most` of each, inside the masks and where depth and normals can be relied on."""
+    window = np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8)
+    found = [(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), *torch.zeros(2, 0, dtype=torch.long))]
+    for t in frames:
+        labels = video.instances[t]
+        inner = cv2.erode((labels > 0).numpy().astype(np.uint8), window) > 0
+        rows = np.argwhere(inner & video.maps.known[t])
+        rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).round().astype(int)]
+        row, column = torch.from_numpy(rows).unbind(-1)
+        depth = torch.from_numpy(video.maps.depth[t])
+        pose = video.camera.world_from_camera[t]
+        normals = _normals(depth, row, column, video.camera.intrinsics[t]) @ pose[:3, :3].T
+        xyz = transform_points(pose, _in_camera(depth, row, column, video.camera.intrinsics[t]))
+        grey = torch.from_numpy(video.maps.grey[t])[row, column].float()
+        found.append((xyz, normals, grey, torch.full_like(row, t), labels[row, column].long()))
+    return Sightings(*(torch.cat(each) for each in zip(*found, strict=True)))
 
 
 def align(
-    model: Model,
-    motions: Float[Tensor, "k 4 4"],
-    tracked: Float[Tensor, "k 4 4"],
-    pivots: Float[Tensor, "k 3"],
-    reach: Float[Tensor, " k"],
-    frame: Frame,
-) -> Float[Tensor, "k 4 4"]:
-    """Motions after some Gauss-Newton steps towards what a frame shows, held by those from tracks.
+    video: Video,
+    sightings: Sightings,
+    part: Int[Tensor, " n"],
+    motions: Float[Tensor, "k t 4 4"],
+    held: Float[Tensor, "k t 4 4"],
+) -> Float[Tensor, "k t 4 4"]:
+    """Motions (float64) after some Gauss-Newton steps towards what the video shows.
 
-    The unknowns are a turn about the moved pivot, times the part's `reach` (m), and a shift: all in m.
+    Residuals have robust weights. Depth: distance from the recorded surface along its normal (point to plane, Chen and
+    Medioni 1992), by projection. Colour: grey, but for the part's mean difference. Outline: distance outside the
+    masks, of points which nothing that stands still can hide. `held` are motions from tracks, by which these are held
+    loosely.
     """
-    count = len(motions)
-    unit = torch.cat((1 / reach[:, None].expand(-1, 3), torch.ones(count, 3)), dim=1)
-    hold = 1 / (_TRACKS_SIGMA_PX * frame.pixel_m) ** 2
-    longest = _LONGEST_STEP_PX * frame.pixel_m
-    start = transform_points(tracked, pivots[:, None])[:, 0]
-    for _ in range(_STEPS):
-        terms = compare(model, motions, frame)
-        pivot = transform_points(motions, pivots[:, None])[:, 0]
-        arm = (terms.points - pivot[model.part]).expand_as(terms.gradients)
-        jacobian = torch.cat((torch.linalg.cross(arm, terms.gradients), terms.gradients), dim=-1) * unit[model.part]
-        weighted = terms.weights[..., None] * jacobian / _CORRELATED
-        square = torch.einsum("cni,cnj->nij", weighted, jacobian)
-        slope = torch.einsum("cni,cn->ni", weighted, terms.residuals)
-        hessian = hold * torch.eye(6).repeat(count, 1, 1)
-        hessian.index_add_(0, model.part, square)
-        turned = motions[:, :3, :3] @ tracked[:, :3, :3].transpose(1, 2)
-        gone = torch.cat((_small_turn(turned), pivot - start), dim=1) / unit
-        gradient = (hold * gone).index_add_(0, model.part, slope)
-        step = -torch.linalg.solve(hessian, gradient).clamp(-longest, longest) * unit
-        rotation = axis_angle_to_matrix(step[:, :3]) @ motions[:, :3, :3]
-        motions = se3(rotation, pivot + step[:, 3:] - (rotation @ pivots[..., None])[..., 0])
-    return motions
+    order = part.argsort(stable=True)
+    points, normals = sightings.at_canonical(motions, part)
+    pivots, reach = centres(points, part, len(motions))
+    sorted_points = Points(
+        points[order].float().numpy(),
+        normals[order].float().numpy(),
+        sightings.grey[order].numpy(),
+        np.searchsorted(part[order].numpy(), np.arange(len(motions) + 1)),
+    )
+    view = video.camera.camera_from_world.double()
+    poses = (view @ motions).contiguous().numpy()
+    drawn = (view @ held).contiguous().numpy()
+    pixel_m = video.pixel_m
+    align_poses(
+        poses,
+        drawn,
+        1 / (_TRACKS_SIGMA_PX * pixel_m) ** 2,
+        pivots.numpy(),
+        reach.numpy(),
+        sorted_points,
+        video.maps,
+        _STEPS,
+        _LONGEST_STEP_PX * pixel_m,
+    )
+    return invert_se3(view) @ torch.from_numpy(poses)
 
 
-def _small_turn(rotations: Float[Tensor, "k 3 3"]) -> Float[Tensor, "k 3"]:
-    """Rotation vectors of small rotations."""
-    skew = (rotations - rotations.transpose(1, 2)) / 2
-    return torch.stack((skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]), dim=-1)
+def centres(
+    points: Float[Tensor, "n 3"], part: Int[Tensor, " n"], count: int
+) -> tuple[Float[Tensor, "k 3"], Float[Tensor, " k"]]:
+    """Mean of each part's points, and their root mean square distance (m) from it."""
+    number = torch.bincount(part, minlength=count).to(points).clamp(min=1)
+    middle = torch.zeros(count, 3).to(points).index_add_(0, part, points) / number[:, None]
+    square = (points - middle[part]).square().sum(-1)
+    spread = torch.zeros(count).to(points).index_add_(0, part, square) / number
+    return middle, spread.sqrt().clamp(min=_LEAST_REACH_M)
 
 
-def _by_point(slopes: Float[Tensor, "c n 2"], in_camera: Float[Tensor, "n 3"], frame: Frame) -> Float[Tensor, "c n 3"]:
-    """Gradients by the world point (per m) from gradients by the pixel (per px)."""
-    focal = frame.camera.intrinsics[0].diagonal()[:2]
-    x, y, z = in_camera.unbind(-1)
-    by_x, by_y = (slopes * focal).unbind(-1)
-    z = z.clamp(min=1e-6)
-    by_camera = torch.stack((by_x / z, by_y / z, -(by_x * x + by_y * y) / z.square()), dim=-1)
-    return by_camera @ frame.camera.camera_from_world[0, :3, :3]
+def carried_costs(
+    video: Video, sightings: Sightings, motions: Float[Tensor, "k t 4 4"], frames: Int[Tensor, " f"]
+) -> Float[Tensor, "n k"]:
+    """How badly each point fits some frames if it follows each of the motions: 0 (agrees) to 1 (contradicts)."""
+    view = video.camera.camera_from_world[frames].double()
+    costs = []
+    for k in range(len(motions)):
+        part = torch.full_like(sightings.frame, k)
+        points, normals = sightings.at_canonical(motions, part)
+        poses = view @ motions[k, frames].double()
+        moved = transform_points(poses, points.expand(len(frames), -1, -1))
+        turned = normals @ poses[:, :3, :3].transpose(1, 2)
+        costs.append(costs_in_camera(video, moved, turned, sightings.grey, frames))
+    return torch.stack(costs, dim=1)
 
 
-def _slope(image: Float[Tensor, "h w"], row: Int[Tensor, " n"], column: Int[Tensor, " n"]) -> Float[Tensor, "n 2"]:
-    """Central differences by x and y, per px."""
-    (left, right), (up, down) = _beside(image, row, column, 1)
-    across = (image[row, right] - image[row, left]) / (right - left)
-    return torch.stack((across, (image[down, column] - image[up, column]) / (down - up)), dim=-1)
+def costs_in_camera(
+    video: Video,
+    points: Float[Tensor, "f n 3"],
+    normals: Float[Tensor, "f n 3"],
+    grey: Float[Tensor, " n"],
+    frames: Int[Tensor, " f"],
+) -> Float[Tensor, " n"]:
+    """Mean cost of points in the cameras of some frames."""
+    arrays = (each.float().contiguous().numpy() for each in (points, normals, grey))
+    return torch.from_numpy(frame_costs(*arrays, frames.numpy(), video.maps)).mean(0)
 
 
-def _beside(
-    image: Float[Tensor, "h w"], row: Int[Tensor, " n"], column: Int[Tensor, " n"], reach: int
-) -> tuple[tuple[Int[Tensor, " n"], Int[Tensor, " n"]], tuple[Int[Tensor, " n"], Int[Tensor, " n"]]]:
-    """Columns to the left and right, and rows above and below, inside the image."""
-    height, width = image.shape
-    columns = ((column - reach).clamp(min=0), (column + reach).clamp(max=width - 1))
-    return columns, ((row - reach).clamp(min=0), (row + reach).clamp(max=height - 1))
+def _in_camera(
+    depth: Float[Tensor, "h w"], row: Int[Tensor, " n"], column: Int[Tensor, " n"], intrinsics: Float[Tensor, "3 3"]
+) -> Float[Tensor, "n 3"]:
+    return unproject(torch.stack((column, row), dim=-1) + 0.5, depth[row, column], intrinsics)
+
+
+def _normals(
+    depth: Float[Tensor, "h w"], row: Int[Tensor, " n"], column: Int[Tensor, " n"], intrinsics: Float[Tensor, "3 3"]
+) -> Float[Tensor, "n 3"]:
+    """Unit normals in the camera, towards it."""
+    height, width = depth.shape
+    left, right = (column - REACH_PX).clamp(min=0), (column + REACH_PX).clamp(max=width - 1)
+    up, down = (row - REACH_PX).clamp(min=0), (row + REACH_PX).clamp(max=height - 1)
+    across = _in_camera(depth, row, right, intrinsics) - _in_camera(depth, row, left, intrinsics)
+    along = _in_camera(depth, down, column, intrinsics) - _in_camera(depth, up, column, intrinsics)
+    return torch.nn.functional.normalize(torch.linalg.cross(along, across), dim=-1)

@@ -51,7 +51,23 @@ class MotionLevel:
         blended = blend(affines, indices, logits)
         rotations = _nearest_rotations(blended, affines, indices, logits)
         turned = quaternion_multiply(matrix_to_quaternion(rotations), orientations)
-        return (blended[..., :3] @ positions[..., None])[..., 0] + blended[..., 3], turned
+        return _applied(blended, positions), turned
+
+    def carry_points(
+        self,
+        positions: Float[Tensor, "b n 3"],
+        indices: Int[Tensor, "n j"],
+        logits: Float[Tensor, "n j"],
+        times: Float[Tensor, " b"] | Int[Tensor, " b"],
+    ) -> Float[Tensor, "b n 3"]:
+        """Positions (m) as `carry` moves them, without orientations, which take most of its time."""
+        if not bool(self.active.any()):
+            return positions
+        return _applied(blend(level_affines(self, times), indices, logits), positions)
+
+
+def _applied(maps: Float[Tensor, "b n 3 4"], points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 3"]:
+    return (maps[..., :3] @ points[..., None])[..., 0] + maps[..., 3]
 
 
 def identity_level(pivots: Float[Tensor, "k 3"], frames: int) -> MotionLevel:

@@ -30,3 +30,17 @@ def compose(
     for level, index, logit in zip(reversed(levels), reversed(indices), reversed(logits), strict=True):
         positions, orientations = level.carry(positions, orientations, index, logit, times)
     return positions, orientations
+
+
+def compose_points(
+    means: Float[Tensor, "n 3"],
+    levels: tuple[Level, ...],
+    indices: tuple[Int[Tensor, "n _"], ...],
+    logits: tuple[Float[Tensor, "n _"], ...],
+    times: Float[Tensor, " b"] | Int[Tensor, " b"],
+) -> Float[Tensor, "b n 3"]:
+    """The means (m) of `compose` alone, in a fraction of its time."""
+    positions = means.expand(len(times), -1, -1)
+    for level, index, logit in zip(reversed(levels), reversed(indices), reversed(logits), strict=True):
+        positions = level.carry_points(positions, index, logit, times)
+    return positions

@@ -40,9 +40,22 @@ class DeformationField:
         times: Float[Tensor, " b"] | Int[Tensor, " b"],
     ) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b n 4"]]:
         """Positions (m) and orientations (wxyz) moved by the field at the times of the batch; no bases are named."""
-        moved = self(positions, times.to(positions)[:, None].expand(positions.shape[:2]))
+        moved = self._at(positions, times)
         turn = torch.nn.functional.normalize(moved[..., 3:] + moved.new_tensor([1.0, 0.0, 0.0, 0.0]), dim=-1)
         return positions + self.extent * moved[..., :3], quaternion_multiply(turn, orientations)
+
+    def carry_points(
+        self,
+        positions: Float[Tensor, "b n 3"],
+        indices: Int[Tensor, "n j"],
+        logits: Float[Tensor, "n j"],
+        times: Float[Tensor, " b"] | Int[Tensor, " b"],
+    ) -> Float[Tensor, "b n 3"]:
+        """Positions (m) as `carry` moves them."""
+        return positions + self.extent * self._at(positions, times)[..., :3]
+
+    def _at(self, positions: Float[Tensor, "b n 3"], times: Tensor) -> Float[Tensor, "b n 7"]:
+        return self(positions, times.to(positions)[:, None].expand(positions.shape[:2]))
 
     def __call__(self, positions: Float[Tensor, "*n 3"], times: Float[Tensor, " *n"]) -> Float[Tensor, "*n 7"]:
         """Output of the network at canonical positions (m) and times (frames)."""

@@ -1,5 +1,6 @@
 """Primitives, grains, particles: levels built on what the coarser ones leave, kept where they prove themselves."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -10,8 +11,8 @@ from lerobot_msdyn.config import LevelName, MotionConfig
 from lerobot_msdyn.motion.bases import MotionLevel, with_idle
 from lerobot_msdyn.motion.binding import bind
 from lerobot_msdyn.motion.clusters import direction_features, displacement_features, filled, k_means, spread_nodes
-from lerobot_msdyn.motion.compose import compose
-from lerobot_msdyn.motion.follow import SceneMotion, unturned
+from lerobot_msdyn.motion.compose import compose_points
+from lerobot_msdyn.motion.follow import SceneMotion
 from lerobot_msdyn.motion.lift import LiftedTracks
 from lerobot_msdyn.motion.residual import (
     ResidualTracks,
@@ -36,6 +37,8 @@ _WORTH = 0.01  # of the error, that a level must take away
 _VISIBLE_PX = 0.3  # that a level must explain: less is not seen, and the drift of the tracks themselves
 _SURE = 3.0  # standard errors that the gain must be: some ten pairs of part and level are judged per episode
 
+Approve = Callable[[MotionLevel], Bool[Tensor, " p"]]  # parts in which a level agrees with what else is known
+
 
 def add_level(
     name: LevelName,
@@ -44,12 +47,13 @@ def add_level(
     so_far: SceneMotion,
     config: MotionConfig,
     noise: float,
+    approve: Approve | None = None,
 ) -> tuple[MotionLevel, ResidualTracks]:
     """The next level, and the tracks as it leaves them.
 
     Each third of the tracks judges a level that was fitted to the others (cross-validation). They choose how much each
     basis is smoothed over time, and, with `config.gate`, in which parts the level is kept: where it explains
-    a visible motion of theirs, and surely so (`_proven`); elsewhere its bases are inactive.
+    a visible motion of theirs, and surely so (`_proven`), and `approve` agrees; elsewhere its bases are inactive.
     """
     names, levels, canonical = (*so_far.names, name), so_far.levels, so_far.canonical_frame
     owner, parents = _cluster(name, tracks, config, noise)
@@ -83,7 +87,10 @@ def add_level(
             judged = _prediction(level(trial, smoothing), name, fold == k, tracks, seen, so_far)
             error[fold == k], gain[fold == k] = judged
         kept = torch.zeros(len(found), dtype=torch.bool)
-        kept[owner[_proven(error, gain, tracks.part, _VISIBLE_PX * seen.pixel_m)[tracks.part]]] = True
+        proven = _proven(error, gain, tracks.part, _VISIBLE_PX * seen.pixel_m)
+        if approve is not None and bool(proven.any()):
+            proven &= approve(found)[: len(proven)]
+        kept[owner[proven[tracks.part]]] = True
         coarser = so_far.levels[-1]
         if name == "grain" and isinstance(coarser, MotionLevel):  # where its primitive was refused, it refines nothing
             kept &= coarser.active[found.parents.clamp(min=0)]
@@ -127,7 +134,7 @@ def _gain(
 ) -> Float[Tensor, " n"]:
     """By how much a level lowers the root mean square error (m) of each track."""
     times = torch.arange(tracks.positions.shape[1])
-    moved, _ = compose(tracks.points, unturned(len(tracks.points)), (level,), (indices,), (logits,), times)
+    moved = compose_points(tracks.points, (level,), (indices,), (logits,), times)
     weights = tracks.weights * ((times - canonical).abs() > _CANONICAL_REACH)
     still = _root_mean_square(tracks.points[:, None] - tracks.positions, weights)
     return still - _root_mean_square(moved.transpose(0, 1) - tracks.positions, weights)
@@ -179,7 +186,7 @@ def _prediction(
         weights = tracks.weights[who][:, times] * ((times - frame).abs() > _QUERY_REACH)
         for motion, total in ((without, without_it), (with_level, with_it)):
             points, part = motion.to_canonical(seen.xyz[who, frame], frame, seen.instance[who])
-            moved, _ = motion.moved(points, part, times)
+            moved = motion.moved_points(points, part, times)
             total[here] += _root_mean_square(moved.transpose(0, 1) - seen.xyz[who][:, times], weights)
         count[here] += 1
     return without_it / count, (without_it - with_it) / count

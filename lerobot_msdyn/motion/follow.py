@@ -9,7 +9,7 @@ from torch import Tensor
 from lerobot_msdyn.config import LevelName
 from lerobot_msdyn.geometry import quaternion_to_matrix
 from lerobot_msdyn.motion.binding import Bindings, bind
-from lerobot_msdyn.motion.compose import Level, compose
+from lerobot_msdyn.motion.compose import Level, compose, compose_points
 
 _VOTERS = 5  # tracks that decide the part of a point
 _CHUNK = 4096  # points whose distances to all tracks are held at a time
@@ -36,6 +36,12 @@ class SceneMotion:
     ) -> tuple[Float[Tensor, "b m 3"], Float[Tensor, "b m 4"]]:
         """Where canonical points (m) are at some times (frames), and how far they have turned (wxyz)."""
         return compose(points, unturned(len(points)), self.levels, *self.bind(points, part), times)
+
+    def moved_points(
+        self, points: Float[Tensor, "m 3"], part: Int[Tensor, " m"], times: Tensor
+    ) -> Float[Tensor, "b m 3"]:
+        """Where canonical points (m) are at some times (frames)."""
+        return compose_points(points, self.levels, *self.bind(points, part), times)
 
     def to_canonical(
         self, points: Float[Tensor, "m 3"], frame: int, instance: Int[Tensor, " m"]

@@ -1,6 +1,6 @@
 """From tracks to the motion of a scene: lift, canonical frame, rigid parts, then one level after the other."""
 
-from collections.abc import Callable
+from dataclasses import replace
 from typing import cast
 
 import torch
@@ -20,6 +20,7 @@ from lerobot_msdyn.motion.lift import LiftedTracks, lift_tracks, position_noise
 from lerobot_msdyn.motion.objects import canonical_frame, initialise_objects
 from lerobot_msdyn.motion.outliers import coherence
 from lerobot_msdyn.motion.parts import split_rigid_parts
+from lerobot_msdyn.motion.register import Recording
 from lerobot_msdyn.motion.residual import ResidualTracks, pull_back
 from lerobot_msdyn.priors.types import PointTracks
 
@@ -31,7 +32,7 @@ _CANONICAL_FRAMES = 2.0  # about the canonical one, over which a point is averag
 _MEAN_ROUNDS = 3  # of robust weights
 _OUTLIER = 3.0  # times the usual distance from the mean: half of the weight and more is lost
 
-Register = Callable[[SceneMotion], SceneMotion]  # improves the poses of the parts, before finer levels are built
+_VOTING_FRAMES = 3  # in which a track was seen, that decide its part
 
 
 def scene_motion(
@@ -39,7 +40,7 @@ def scene_motion(
     depth: Float[Tensor, "t h w"],
     camera: CameraTrack,
     config: MotionConfig,
-    register: Register | None = None,
+    recording: Recording | None = None,
 ) -> SceneMotion | None:
     """Motion of everything that was tracked, or None where nothing was.
 
@@ -48,7 +49,7 @@ def scene_motion(
         depth: z-depth in m, 0 = unknown.
         camera: the camera that saw both.
         config: the levels.
-        register: improves the object level by what tracks do not tell.
+        recording: what the video shows, by which the object level is improved and finer ones are judged.
     """
     xyz, valid = lift_tracks(tracks, depth, camera)
     kept = _longest(valid, tracks.instance)
@@ -58,10 +59,10 @@ def scene_motion(
     in_camera = transform_points(camera.camera_from_world, xyz.transpose(0, 1))[..., 2].T[valid]
     pixel_m = float(in_camera.median() / camera.intrinsics[0, 0, 0])
     lifted = LiftedTracks(xyz, valid, tracks.confidence[kept], tracks.instance[kept], pixel_m)
-    return motion_from_tracks(lifted, config, register)
+    return motion_from_tracks(lifted, config, recording)
 
 
-def motion_from_tracks(tracks: LiftedTracks, config: MotionConfig, register: Register | None = None) -> SceneMotion:
+def motion_from_tracks(tracks: LiftedTracks, config: MotionConfig, recording: Recording | None = None) -> SceneMotion:
     """All levels of motion (the paper's section on initialisation; docs/method.md), from at least one track."""
     noise = position_noise(tracks.xyz, tracks.valid)
     canonical = canonical_frame(tracks.valid, tracks.instance)
@@ -77,9 +78,12 @@ def motion_from_tracks(tracks: LiftedTracks, config: MotionConfig, register: Reg
         still_m=_STILL_PX * tracks.pixel_m,
         frames_per_knot=config.frames_per_knot.object,
     )
-    if register is not None and config.levels[0] == "object" and bool(objects.active.any()):
-        registered = register(SceneMotion(("object",), (objects,), canonical, points, part, tracks.instance))
-        objects, points = cast(MotionLevel, registered.levels[0]), registered.points
+    by_tracks = registered = SceneMotion(("object",), (objects,), canonical, points, part, tracks.instance)
+    if recording is not None and config.levels[0] == "object" and bool(objects.active.any()):
+        registered = recording.register(by_tracks, config)
+    if registered is not by_tracks:
+        objects = cast(MotionLevel, registered.levels[0])
+        part = _parts_of(registered, tracks)
     weights = torch.where(tracks.valid, tracks.confidence.square(), 0.0)
     names, levels = _first_level(config, objects, points, tracks.xyz, weights, canonical, noise)
     positions = pull_back(objects, part[:, None], torch.zeros(len(part), 1), tracks.xyz)
@@ -88,10 +92,35 @@ def motion_from_tracks(tracks: LiftedTracks, config: MotionConfig, register: Reg
     left = ResidualTracks(near_canonical(positions, weights, canonical), positions, weights, part, part)
     for name in config.levels[1:]:
         so_far = SceneMotion(names, levels, canonical, left.points, part, tracks.instance)
-        level, left = add_level(name, left, tracks, so_far, config, noise)
+        approve = None
+        if recording is not None and registered is not by_tracks:
+            approve = recording.approval(replace(registered, names=names, levels=levels), name)
+        level, left = add_level(name, left, tracks, so_far, config, noise, approve)
         names, levels = (*names, name), (*levels, level)
         points = _usual_positions(left.positions, weights, noise)
+    if recording is not None and registered is not by_tracks:
+        return recording.guided(replace(registered, names=names, levels=levels))
     return SceneMotion(names, levels, canonical, points, part, tracks.instance)
+
+
+def _parts_of(motion: SceneMotion, tracks: LiftedTracks) -> Int[Tensor, " n"]:
+    """Part of every track, by what is near it where it is seen; no part is left without tracks."""
+    count = len(cast(MotionLevel, motion.levels[0]))
+    votes = torch.zeros(len(tracks.xyz), count)
+    at_canonical = torch.zeros(len(tracks.xyz), 3)
+    seen = tracks.valid.cumsum(1)
+    for share in torch.linspace(0, 1, _VOTING_FRAMES + 2)[1:-1].tolist():
+        at = (seen >= (share * seen[:, -1:]).clamp(min=1)).int().argmax(1)
+        for frame in at.unique().tolist():
+            rows = (at == frame).nonzero()[:, 0]
+            at_canonical[rows], found = motion.to_canonical(tracks.xyz[rows, frame], frame, tracks.instance[rows])
+            votes[rows, found] += 1
+    part = votes.argmax(1)
+    for k in range(count):
+        own = motion.points[motion.part == k]
+        if len(own) and not bool((part == k).any()):
+            part[(at_canonical - own.mean(0)).norm(dim=-1).argmin()] = k
+    return part
 
 
 def _first_level(

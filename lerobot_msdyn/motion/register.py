@@ -1,159 +1,120 @@
 """Rigid parts registered to the recorded depth, pictures and masks, where tracks alone let plain surfaces slide."""
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import cast
 
-import cv2
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from lerobot_msdyn.cameras import CameraTrack
-from lerobot_msdyn.geometry import invert_se3, matrix_to_rotation_6d, se3, transform_points
-from lerobot_msdyn.motion.alignment import Frame, Model, align, compare, read_frame
-from lerobot_msdyn.motion.bases import MotionLevel, level_affines
+from lerobot_msdyn.config import LevelName, MotionConfig
+from lerobot_msdyn.geometry import invert_se3, quaternion_to_matrix, se3, transform_points
+from lerobot_msdyn.motion.alignment import Sightings, Video, centres, costs_in_camera, read_video, sight
+from lerobot_msdyn.motion.bases import MotionLevel, level_affines, level_from_motions
 from lerobot_msdyn.motion.follow import SceneMotion
+from lerobot_msdyn.motion.regroup import Grouping, regroup
 
-_MODEL_FRAMES = 14  # evenly spread, from which the model is gathered; those half-way between them judge
-_POINTS = 100  # of a part from a frame
-_PIXELS = 3000  # of a frame, among which they are sought
-_BORDER_PX = 2  # of the masks, without points
-_ROUNDS = 3  # of gathering a model and aligning it
+_MODEL_FRAMES = 14  # evenly spread, from which points are gathered; those half-way between them judge
+_POINTS = 400  # of a frame
+_JUDGES = 150  # of a frame
 _JUDGED_FRAMES = 24
-_OUTLIER = 3.0  # sigmas beyond which a judge's error hardly grows
+_WORTH = 0.01  # of the judges' cost, that a finer level must take away
 
 
-def register_parts(
-    motion: SceneMotion,
-    rgb: UInt8[Tensor, "t h w 3"],
-    depth: Float[Tensor, "t h w"],
-    instances: UInt8[Tensor, "t h w"],
-    camera: CameraTrack,
-) -> SceneMotion:
-    """The motion with better poses of its rigid parts (docs/method.md, "Registration").
+@dataclass(frozen=True)
+class Recording:
+    """What was recorded of a scene, as evidence of how it moves."""
 
-    A model is gathered from some frames by the motion so far and aligned to every frame, in turn. A part keeps the
-    pose from tracks unless points that were gathered at other frames agree better with the video by the new one.
+    video: Video
+    points: Sightings  # that are aligned
+    judges: Sightings  # of other frames
 
-    Args:
-        motion: an object level alone.
-        rgb: the video.
-        depth: z-depth in m, 0 = unknown.
-        instances: 0 = what stands still.
-        camera: the camera that saw them.
-    """
-    frames, seen = len(rgb), depth[(instances > 0) & (depth > 0)]
-    if len(seen) == 0:
-        return motion
-    pixel_m = float(seen.median() / camera.intrinsics[0, 0, 0])
-    shown = [read_frame(rgb[t], depth[t], instances[t], camera.select([t]), pixel_m) for t in range(frames)]
-    spread = torch.linspace(0, frames - 1, 2 * _MODEL_FRAMES - 1).round().long().unique().tolist()
-    tracked, found = _motions(_object_level(motion), frames), motion
-    for _ in range(_ROUNDS):
-        found, tracked = _round(found, tracked, shown, spread[::2])
-    better = _errors(found, shown, spread[1::2]) < _errors(motion, shown, spread[1::2])
-    return _chosen(better, found, motion)
+    @classmethod
+    def of(
+        cls,
+        rgb: UInt8[Tensor, "t h w 3"],
+        depth: Float[Tensor, "t h w"],
+        instances: UInt8[Tensor, "t h w"],
+        camera: CameraTrack,
+    ) -> "Recording | None":
+        """That of a video with z-depth (m, 0 = unknown) and instances (0 = what stands still); None if none moves."""
+        seen = depth[(instances > 0) & (depth > 0)]
+        if len(seen) == 0:
+            return None
+        video = read_video(rgb, depth, instances, camera, float(seen.median() / camera.intrinsics[0, 0, 0]))
+        spread = torch.linspace(0, len(rgb) - 1, 2 * _MODEL_FRAMES - 1).round().long().unique().tolist()
+        return cls(video, sight(video, spread[::2], _POINTS), sight(video, spread[1::2], _JUDGES))
+
+    def register(self, motion: SceneMotion, config: MotionConfig) -> SceneMotion:
+        """An object level with better parts and poses, followed by the points of this recording.
+
+        Unless points that were gathered at other frames agree better with the whole clip by the new motion, it stays
+        as it is.
+        """
+        if len(self.points) == 0:
+            return motion
+        found = regroup(self.video, self.points, self._start(motion), config.max_parts)
+        new = _with_parts(motion, found, self.points, config.frames_per_knot.object)
+        return new if self.costs(new)[0].mean() < self.costs(motion)[0].mean() else motion
+
+    def approval(self, motion: SceneMotion, name: LevelName) -> Callable[[MotionLevel], Bool[Tensor, " k"]]:
+        """Says in which parts another level, of this name, makes the judges agree better with the clip."""
+
+        def approve(level: MotionLevel) -> Bool[Tensor, " k"]:
+            finer = replace(motion, names=(*motion.names, name), levels=(*motion.levels, level))
+            before, part = self.costs(motion)
+            total, gain = torch.zeros(2, len(cast(MotionLevel, motion.levels[0])))
+            total.index_add_(0, part, before)
+            gain.index_add_(0, part, before - self.costs(finer)[0])
+            return gain > _WORTH * total
+
+        return approve
+
+    def guided(self, motion: SceneMotion) -> SceneMotion:
+        """The motion, followed by the points of this recording where all of its levels put them."""
+        return replace(motion, points=_traced(motion, self.points)[0])
+
+    def costs(self, motion: SceneMotion) -> tuple[Float[Tensor, " n"], Int[Tensor, " n"]]:
+        """How badly each judge fits the clip when a motion carries it (0 to 1), and the part that it follows."""
+        frames = torch.linspace(0, len(self.video) - 1, _JUDGED_FRAMES).round().long().unique()
+        view = self.video.camera.camera_from_world[frames]
+        points, part = _traced(motion, self.judges)
+        moved, turns = motion.moved(points, part, torch.cat((frames, self.judges.frame.unique())))
+        rotations = quaternion_to_matrix(turns)
+        seen_at = len(frames) + torch.unique(self.judges.frame, return_inverse=True)[1]
+        back = rotations[seen_at, torch.arange(len(part))].transpose(1, 2)
+        normals = rotations[: len(frames)] @ (back @ self.judges.normals[..., None])
+        in_camera = normals[..., 0] @ view[:, :3, :3].transpose(1, 2)
+        placed = transform_points(view, moved[: len(frames)])
+        return costs_in_camera(self.video, placed, in_camera, self.judges.grey, frames), part
+
+    def _start(self, motion: SceneMotion) -> Grouping:
+        level = cast(MotionLevel, motion.levels[0])
+        affines = level_affines(level, torch.arange(len(self.video)))
+        motions = se3(affines[..., :3], affines[..., 3]).double()
+        instance = torch.zeros(len(level), dtype=torch.long)
+        instance[motion.part] = motion.instance
+        return Grouping(_traced(motion, self.points)[1], motions, motions, instance, level.active)
 
 
-def _round(
-    motion: SceneMotion, tracked: Float[Tensor, "k t 4 4"], shown: list[Frame], frames: list[int]
-) -> tuple[SceneMotion, Float[Tensor, "k t 4 4"]]:
-    """Gather and align once; the canonical points go where the alignment puts them at the canonical frame.
-
-    `tracked` are the motions from tracks, here and in what is returned of the canonical points of the motion beside it.
-    """
-    level = _object_level(motion)
-    model = _gather(motion, shown, frames)
-    if len(model.part) == 0:
-        return motion, tracked
-    before, reach = _motions(level, len(shown)), _reach(model, level.pivots)
-    aligned = [align(model, before[:, t], tracked[:, t], level.pivots, reach, shown[t]) for t in range(len(shown))]
-    after = torch.where(level.active[:, None, None, None], torch.stack(aligned, dim=1), before)
-    gauge = after[:, motion.canonical_frame]
-    back = invert_se3(gauge)[:, None]
-    pivots = transform_points(gauge, level.pivots[:, None])[:, 0]
-    points = transform_points(gauge[motion.part], motion.points[:, None])[:, 0]
-    return replace(motion, levels=(_with_motions(level, after @ back, pivots),), points=points), tracked @ back
+def _traced(motion: SceneMotion, seen: Sightings) -> tuple[Float[Tensor, "n 3"], Int[Tensor, " n"]]:
+    """Canonical points (m), and parts, of what frames show."""
+    points, part = torch.zeros_like(seen.xyz), torch.zeros_like(seen.frame)
+    for t in seen.frame.unique().tolist():
+        rows = seen.frame == t
+        points[rows], part[rows] = motion.to_canonical(seen.xyz[rows], t, seen.instance[rows])
+    return points, part
 
 
-def _object_level(motion: SceneMotion) -> MotionLevel:
-    return cast(MotionLevel, motion.levels[0])
-
-
-def _motions(level: MotionLevel, frames: int) -> Float[Tensor, "k t 4 4"]:
-    """The motions of a level at all frames."""
-    affines = level_affines(level, torch.arange(frames))
-    return se3(affines[..., :3], affines[..., 3])
-
-
-def _with_motions(level: MotionLevel, motions: Float[Tensor, "k t 4 4"], pivots: Float[Tensor, "k 3"]) -> MotionLevel:
-    """A level with other motions, about other pivots (m)."""
-    chosen = motions[:, level.knots.long()]
-    moved = (chosen[..., :3, :3] @ pivots[:, None, :, None])[..., 0] + chosen[..., :3, 3]
-    return replace(
-        level,
-        rotations_6d=matrix_to_rotation_6d(chosen[..., :3, :3]),
-        displacements=moved - pivots[:, None],
-        pivots=pivots,
+def _with_parts(motion: SceneMotion, found: Grouping, seen: Sightings, frames_per_knot: int) -> SceneMotion:
+    """The motion by other parts, which are the identity at the canonical frame."""
+    at_canonical = found.motions[:, motion.canonical_frame]
+    motions = found.motions @ invert_se3(at_canonical)[:, None]
+    points = seen.at_canonical(motions, found.part)[0].float()
+    pivots = centres(points, found.part, len(motions))[0]
+    level = level_from_motions(
+        motions.float(), pivots, active=found.active, frames_per_knot=frames_per_knot, canonical=motion.canonical_frame
     )
-
-
-def _gather(motion: SceneMotion, shown: list[Frame], frames: list[int]) -> Model:
-    """Points of all parts, from some frames, at the canonical frame."""
-    window = np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8)
-    gathered = [(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, dtype=torch.long))]
-    for t in frames:
-        frame = shown[t]
-        inner = cv2.erode((frame.instances > 0).numpy().astype(np.uint8), window) > 0
-        row, column = _thinned((torch.from_numpy(inner) & frame.known).nonzero(), _PIXELS).unbind(-1)
-        if len(row) == 0:
-            continue
-        points, part = motion.to_canonical(frame.xyz(row, column), t, frame.instances[row, column].long())
-        kept = torch.cat([_thinned((part == k).nonzero()[:, 0], _POINTS) for k in part.unique()])
-        turns = level_affines(_object_level(motion), torch.tensor([t]))[part, 0, :, :3]
-        normals = (turns.transpose(1, 2) @ frame.normals(row, column)[..., None])[..., 0]
-        gathered.append((points[kept], normals[kept], frame.grey[row, column][kept], part[kept]))
-    return Model(*(torch.cat(each) for each in zip(*gathered, strict=True)))
-
-
-def _thinned(rows: Int[Tensor, "n *_"], most: int) -> Int[Tensor, "m *_"]:
-    """Evenly spread rows, `most` at most."""
-    return rows[torch.linspace(0, len(rows) - 1, min(len(rows), most)).round().long()]
-
-
-def _reach(model: Model, pivots: Float[Tensor, "k 3"]) -> Float[Tensor, " k"]:
-    """Root mean square distance (m) of each part's points from its pivot; of parts without points, 1 m."""
-    square, count = torch.zeros(2, len(pivots))
-    square.index_add_(0, model.part, (model.points - pivots[model.part]).square().sum(-1))
-    count.index_add_(0, model.part, torch.ones(len(model.part)))
-    return torch.where(count > 0, (square / count.clamp(min=1)).sqrt().clamp(min=1e-3), 1.0)
-
-
-def _errors(motion: SceneMotion, shown: list[Frame], frames: list[int]) -> Float[Tensor, " k"]:
-    """Robust mean error of each part, of points gathered from some frames and compared with the whole clip."""
-    level = _object_level(motion)
-    model, motions = _gather(motion, shown, frames), _motions(level, len(shown))
-    error, count = torch.zeros(2, len(level))
-    for t in torch.linspace(0, len(shown) - 1, _JUDGED_FRAMES).round().long().unique().tolist():
-        terms = compare(model, motions[:, t], shown[t])
-        square = (terms.residuals / _OUTLIER).square()
-        cost = square / (1 + square)
-        cost[2] = 1  # shown where nothing moves
-        used = terms.weights > 0
-        error.index_add_(0, model.part, (used * cost).sum(0))
-        count.index_add_(0, model.part, (used[0] | used[2]).float())
-    return error / count.clamp(min=1)
-
-
-def _chosen(better: Bool[Tensor, " k"], new: SceneMotion, old: SceneMotion) -> SceneMotion:
-    """The new motion of some parts, the old one of the others."""
-    level, before = _object_level(new), _object_level(old)
-    rows = better[:, None, None]
-    mixed = replace(
-        before,
-        rotations_6d=torch.where(rows, level.rotations_6d, before.rotations_6d),
-        displacements=torch.where(rows, level.displacements, before.displacements),
-        pivots=torch.where(better[:, None], level.pivots, before.pivots),
-    )
-    return replace(old, levels=(mixed,), points=torch.where(better[old.part][:, None], new.points, old.points))
+    return replace(motion, levels=(level,), points=points, part=found.part, instance=seen.instance)

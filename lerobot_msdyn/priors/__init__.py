@@ -7,14 +7,14 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from lerobot_msdyn.priors.estimate import estimate_priors
+    from lerobot_msdyn.priors.estimate import estimate_masks, estimate_priors
     from lerobot_msdyn.priors.types import Origin, PointTracks, Priors
 
-__all__ = ["Origin", "PointTracks", "Priors", "estimate_priors"]
+__all__ = ["Origin", "PointTracks", "Priors", "estimate_masks", "estimate_priors"]
 
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    home = "estimate" if name == "estimate_priors" else "types"
+    home = "estimate" if name.startswith("estimate") else "types"
     return getattr(importlib.import_module(f"{__name__}.{home}"), name)

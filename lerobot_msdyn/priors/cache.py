@@ -29,6 +29,7 @@ Arrays = dict[str, np.ndarray]
 
 ENVIRONMENT = "LEROBOT_MSDYN_CACHE"
 _DIGEST = 16  # bytes
+_OFF = ("off", "False")  # YAML reads off as false
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,9 @@ class PriorCache:
         """
         if self.folder is None:
             return compute()
-        content = json.dumps({"settings": settings, "code": _code_digest()}, sort_keys=True, default=str)
+        content = json.dumps(
+            {"settings": settings, "code": code_digest(Path(__file__).parent)}, sort_keys=True, default=str
+        )
         path = self.folder / f"{prior}-{provider}-{_digest(content.encode())}.npz"
         found = _read(path)
         if found is not None:
@@ -67,7 +70,7 @@ class PriorCache:
 
 def open_cache(setting: str, rgb: UInt8[Tensor, "t h w 3"]) -> PriorCache:
     """The cache of a video under the folder that the setting names: `auto`, `off`, or the folder itself."""
-    if setting == "off":
+    if setting in _OFF:
         return PriorCache(None)
     folder = default_folder() if setting == "auto" else Path(setting).expanduser()
     return PriorCache(folder / digest_of(rgb))
@@ -111,9 +114,9 @@ def save_npz(path: Path, arrays: Arrays) -> None:
 
 
 @functools.cache
-def _code_digest() -> str:
-    """Changes whenever a module of this folder does."""
-    return _digest(*(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py"))))
+def code_digest(folder: Path) -> str:
+    """Changes whenever a module in a folder does."""
+    return _digest(*(path.read_bytes() for path in sorted(folder.rglob("*.py"))))
 
 
 def _digest(*parts: bytes | memoryview) -> str:

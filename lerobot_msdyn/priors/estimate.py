@@ -10,7 +10,6 @@ from lerobot_msdyn.config import CameraConfig, PriorsConfig
 from lerobot_msdyn.episode import View
 from lerobot_msdyn.priors.cache import open_cache
 from lerobot_msdyn.priors.hub import torch_device
-from lerobot_msdyn.priors.masks import empty_scene, temporal_median
 from lerobot_msdyn.priors.provide_cameras import provide_camera, with_searched_fov
 from lerobot_msdyn.priors.provide_depth import provide_depth
 from lerobot_msdyn.priors.provide_masks import provide_masks
@@ -56,10 +55,24 @@ def estimate_priors(
     pinhole = request.view.camera
     if camera.fov_search:
         pinhole, camera_from = with_searched_fov(pinhole, tracks, depth, depth_from.provider)
-    empty = empty_scene(view.rgb, instances, temporal_median(view.rgb, elsewhere)[0])
     origins = {"camera": camera_from, "masks": masks_from, "depth": depth_from, "tracks": tracks_from}
     found = {"masks": f", {int(instances.max())} instances", "tracks": f", {len(tracks)} tracks"}
     for prior, origin in origins.items():
         logger.info("%s: %s%s", prior, origin.line, found.get(prior, ""))
     provenance = {prior: origin.entry() for prior, origin in origins.items()}
-    return Priors(depth, instances, empty, tracks, metric, provenance, pinhole)
+    return Priors(depth, instances, tracks, metric, provenance, pinhole)
+
+
+def estimate_masks(
+    view: View,
+    config: PriorsConfig,
+    camera: CameraConfig,
+    *,
+    elsewhere: UInt8[Tensor, "m h w 3"] | None = None,
+    episode: int | None = None,
+    key: str | None = None,
+    device: str = "auto",
+) -> UInt8[Tensor, "t h w"]:
+    """The masks of `estimate_priors` alone (0 = nothing moves), which finds them in the cache afterwards."""
+    cache = open_cache(config.cache, view.rgb)
+    return provide_masks(Request(view, config, camera, cache, (), elsewhere, episode, key, torch_device(device)))[0]

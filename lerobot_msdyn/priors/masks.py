@@ -24,6 +24,7 @@ from lerobot_msdyn.priors.change import Colours, Reference, along_edges, changes
 from lerobot_msdyn.priors.ghosts import without_ghosts
 from lerobot_msdyn.priors.linking import numbered
 from lerobot_msdyn.priors.medians import median_where
+from lerobot_msdyn.priors.parallel import on_all_cores
 from lerobot_msdyn.priors.stabilise import camera_sway, to_frames, to_reference
 from lerobot_msdyn.priors.votes import AUDIBLE, votes
 from lerobot_msdyn.priors.wandering import residual_odds
@@ -56,15 +57,6 @@ def temporal_median(
     distance = np.stack([np.linalg.norm(to_lab(frame) - reference, axis=-1) for frame in frames])
     noise = np.median(distance, axis=0).clip(min=_NOISE_FLOOR).astype(np.float32)
     return torch.from_numpy(median), torch.from_numpy(noise)
-
-
-def empty_scene(
-    rgb: UInt8[Tensor, "t h w 3"], instances: UInt8[Tensor, "t h w"], median: UInt8[Tensor, "h w 3"]
-) -> UInt8[Tensor, "h w 3"]:
-    """The temporal median over frames in which nothing moves at the pixel; the plain `median` where there is none."""
-    mask = instances.cpu().numpy() > 0
-    around = np.stack([cv2.dilate(m.astype(np.uint8), np.ones((5, 5), np.uint8)) for m in mask])
-    return torch.from_numpy(_median_where(rgb.cpu().numpy(), around == 0, median.cpu().numpy()))
 
 
 def moving_instances(
@@ -187,8 +179,11 @@ def _mended(
         empty = np.where(ghost[..., None], mended, _median_where(studied, bare, empty))
         known = ghost | (bare.sum(0) >= _MIN_EMPTY_FRAMES)
     reference = Reference(empty, noise)
-    parts = zip(frames, voted, strict=True)
-    return np.stack([_tidy(_odds(f, vote, known, reference.change(f), colours) > 0) for f, vote in parts])
+
+    def moving_at(frame: tuple[ndarray, ndarray]) -> Bool[ndarray, "h w"]:
+        return _tidy(_odds(*frame, known, reference.change(frame[0]), colours) > 0)
+
+    return np.stack(on_all_cores(moving_at, zip(frames, voted, strict=True)))
 
 
 def _odds(
@@ -212,11 +207,15 @@ def _judged(
 ) -> tuple[Float32[ndarray, "s h w"], Colours]:
     """Log-odds that each pixel belongs to something that moves, and the colours that were learnt on the way."""
     reference, colours = Reference(empty, noise), Colours()
-    differences = [reference.change(frame) for frame in frames]
+    differences = on_all_cores(reference.change, frames)
     for frame, difference in zip(frames, differences, strict=True):
         colours.add(frame, np.where(known & region, difference, 0), _SURE)
-    parts = zip(frames, voted, differences, strict=True)
-    return np.stack([_odds(f, vote, known, difference, colours) for f, vote, difference in parts]), colours
+
+    def odds_at(frame: tuple[ndarray, ndarray, ndarray]) -> Float32[ndarray, "h w"]:
+        picture, vote, difference = frame
+        return _odds(picture, vote, known, difference, colours)
+
+    return np.stack(on_all_cores(odds_at, zip(frames, voted, differences, strict=True))), colours
 
 
 def _ever_changing(changed: Bool[ndarray, "t h w"]) -> Bool[ndarray, "h w"]:

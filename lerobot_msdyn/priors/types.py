@@ -54,7 +54,6 @@ class Priors:
 
     depth: Float[Tensor, "t h w"]  # m, z-depth; 0 = unknown
     instances: UInt8[Tensor, "t h w"]  # 0 = static background, 1.. = moving instances
-    empty: UInt8[Tensor, "h w 3"]  # colours of the scene without what moves
     tracks: PointTracks
     metric: bool  # whether depth is in true metres (a sensor or a calibration) or only plausible
     provenance: dict[str, dict[str, str]] = field(default_factory=dict)  # prior -> provider, why, model, licence

@@ -4,17 +4,38 @@ Kernels release the GIL and take their work by tickets from a shared counter, so
 them. numba's own threading layers were not used: `omp` kills forked children (DataLoader workers), `workqueue`
 aborts the process when two Python threads enter it, `tbb` is one more thing to install; and all three are
 process-wide choices that a library should leave to its user. The number of threads is torch's (1 inside DataLoader
-workers).
+workers), or that which it had before `torch_on_one_thread`.
 """
 
+import contextlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextvars import ContextVar
 from functools import cache
 from typing import Any
 
 import numpy as np
 import torch
+
+_threads: ContextVar[int | None] = ContextVar("threads", default=None)
+
+
+@contextlib.contextmanager
+def torch_on_one_thread() -> Iterator[None]:
+    """Torch on one thread, kernels on as many as before.
+
+    Thousands of small tensor operations are slower when torch spreads each over all cores, many times slower where
+    other programs want these too: its threads wait for each other without letting go of their core.
+    """
+    threads = torch.get_num_threads()
+    token = _threads.set(_threads.get() or threads)
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+        _threads.reset(token)
 
 
 @cache
@@ -30,7 +51,7 @@ if hasattr(os, "register_at_fork"):
 def run(kernel: Callable[..., None], items: int, *arguments: Any) -> None:
     """Call `kernel(tickets, *arguments)` on as many threads as torch uses and `items` tickets can feed."""
     tickets = np.zeros(1, np.int64)
-    helpers = min(torch.get_num_threads(), items) - 1
+    helpers = min(_threads.get() or torch.get_num_threads(), items) - 1
     futures = [_pool().submit(kernel, tickets, *arguments) for _ in range(helpers)]
     kernel(tickets, *arguments)
     for future in futures:

@@ -1,12 +1,18 @@
-"""Hand-built tracks of rigid bodies."""
+"""Hand-built tracks of rigid bodies, and a small scene whose parts are known."""
+
+from collections.abc import Callable
 
 import pytest
 import torch
 from torch import Tensor
 
-from lerobot_msdyn.geometry import axis_angle_to_matrix, se3, transform_points
+from lerobot_msdyn.geometry import axis_angle_to_matrix, invert_se3, se3, transform_points
+from lerobot_msdyn.motion.alignment import Sightings, Video, carried_costs, read_video, sight
+from lerobot_msdyn.motion.regroup import Grouping
+from lerobot_msdyn.synthetic import SyntheticScene, make_scene
 
 FRAMES = 24
+PUSHED_FRAMES = 12
 
 
 class Body:
@@ -45,3 +51,55 @@ def resting() -> Body:
 @pytest.fixture
 def late() -> Body:
     return Body(2, (0.3, 0.1, 0.9), (0.0, 0.6, 0.0), (0.0, 0.2, 0.0), start=12)
+
+
+@pytest.fixture(scope="session")
+def pushed() -> SyntheticScene:
+    return make_scene("push", 0, PUSHED_FRAMES, 160, 120)
+
+
+@pytest.fixture(scope="session")
+def video(pushed: SyntheticScene) -> Video:
+    view = pushed.render(pushed.camera)
+    pixel_m = float(view.depth[view.instances > 0].median() / pushed.camera.intrinsics[0, 0, 0])
+    return read_video(view.rgb, view.depth, view.instances, pushed.camera, pixel_m)
+
+
+@pytest.fixture(scope="session")
+def points(video: Video) -> Sightings:
+    return sight(video, list(range(0, PUSHED_FRAMES, 2)), 300)
+
+
+@pytest.fixture(scope="session")
+def truth(pushed: SyntheticScene, points: Sightings) -> Grouping:
+    """Every body a part, and each point in the part of the nearest tracked point of its instance."""
+    tracks = pushed.tracks(1500)
+    bodies, part = tracks.body.unique(return_inverse=True)
+    own = torch.stack(
+        [
+            part[
+                torch.where(
+                    tracks.instance == points.instance[i],
+                    (tracks.positions[:, points.frame[i]] - points.xyz[i]).norm(dim=-1),
+                    torch.inf,
+                ).argmin()
+            ]
+            for i in range(len(points))
+        ]
+    )
+    instance = torch.zeros(len(bodies), dtype=torch.long)
+    instance[part] = tracks.instance
+    motions = pushed.world_from_body[bodies].double()
+    motions = motions @ invert_se3(motions[:, PUSHED_FRAMES // 2])[:, None]
+    return Grouping(own, motions, motions, instance, torch.ones(len(bodies), dtype=torch.bool))
+
+
+@pytest.fixture(scope="session")
+def cost(video: Video, points: Sightings) -> Callable[[Grouping], float]:
+    """Mean cost of the points in the parts of a grouping."""
+
+    def of(found: Grouping) -> float:
+        costs = carried_costs(video, points, found.motions, torch.arange(PUSHED_FRAMES))
+        return float(costs.gather(1, found.part[:, None]).mean())
+
+    return of

@@ -5,10 +5,13 @@ from dataclasses import replace
 import pytest
 import torch
 
+from lerobot_msdyn.config import MotionConfig
 from lerobot_msdyn.geometry import invert_se3
+from lerobot_msdyn.motion.alignment import Sightings, Video
 from lerobot_msdyn.motion.bases import level_affines, level_from_motions
 from lerobot_msdyn.motion.follow import SceneMotion
-from lerobot_msdyn.motion.register import register_parts
+from lerobot_msdyn.motion.register import Recording
+from lerobot_msdyn.motion.regroup import Grouping
 from lerobot_msdyn.synthetic import SyntheticScene, SyntheticTracks, SyntheticView, make_scene
 
 FRAMES, CANONICAL = 12, 6
@@ -54,32 +57,68 @@ def errors_mm(motion: SceneMotion, tracks: SyntheticTracks) -> torch.Tensor:
     return torch.stack(out)
 
 
+@pytest.fixture(scope="module")
+def recording(scene: SyntheticScene, view: SyntheticView) -> Recording:
+    found = Recording.of(view.rgb, view.depth, view.instances, scene.camera)
+    assert found is not None
+    return found
+
+
+@pytest.fixture(scope="module")
+def registered(recording: Recording, disturbed: SceneMotion) -> SceneMotion:
+    return recording.register(disturbed, MotionConfig())
+
+
 def test_registration_corrects_disturbed_poses(
-    scene: SyntheticScene, view: SyntheticView, tracks: SyntheticTracks, disturbed: SceneMotion
+    tracks: SyntheticTracks, disturbed: SceneMotion, registered: SceneMotion
 ) -> None:
-    registered = register_parts(disturbed, view.rgb, view.depth, view.instances, scene.camera)
     before, after = errors_mm(disturbed, tracks), errors_mm(registered, tracks)
     assert after.mean() < 0.6 * before.mean()
     assert after.median() < 0.4 * before.median()
 
 
-def test_canonical_frame_stays_the_identity(scene: SyntheticScene, view: SyntheticView, disturbed: SceneMotion) -> None:
-    registered = register_parts(disturbed, view.rgb, view.depth, view.instances, scene.camera)
+def test_canonical_frame_stays_the_identity(registered: SceneMotion) -> None:
     at_canonical = level_affines(registered.levels[0], torch.tensor([CANONICAL]))[:, 0]
     torch.testing.assert_close(at_canonical, torch.eye(3, 4).expand_as(at_canonical), atol=1e-5, rtol=0)
 
 
-def test_inactive_parts_stay(scene: SyntheticScene, view: SyntheticView, disturbed: SceneMotion) -> None:
+def test_judges_prefer_the_better_motion(recording: Recording, disturbed: SceneMotion, registered: SceneMotion) -> None:
+    assert recording.costs(registered)[0].mean() < 0.9 * recording.costs(disturbed)[0].mean()
+
+
+def test_a_worse_motion_is_refused(
+    recording: Recording, registered: SceneMotion, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def shifted(video: Video, points: Sightings, start: Grouping, max_parts: int) -> Grouping:
+        off = torch.eye(4).repeat(FRAMES, 1, 1).double()
+        off[::2, 2, 3] = 0.05
+        return replace(start, motions=off @ start.motions)
+
+    monkeypatch.setattr("lerobot_msdyn.motion.register.regroup", shifted)
+    assert recording.register(registered, MotionConfig()) is registered
+
+
+def test_a_level_that_disagrees_with_the_video_is_not_approved(recording: Recording, registered: SceneMotion) -> None:
+    count = len(registered.levels[0])
+    motions = torch.eye(4).repeat(count, FRAMES, 1, 1)
+    approve = recording.approval(registered, "primitive")
+    parents, pivots = torch.arange(count), registered.levels[0].pivots
+    still = level_from_motions(motions, pivots, parents=parents, canonical=CANONICAL)
+    motions[:, 1::2, 2, 3] = 0.03
+    shaken = level_from_motions(motions, pivots, parents=parents, canonical=CANONICAL)
+    followed = registered.part.unique()
+    assert not bool(approve(still)[followed].any())
+    assert not bool(approve(shaken)[followed].any())
+
+
+def test_inactive_parts_stay(recording: Recording, disturbed: SceneMotion) -> None:
     still = replace(disturbed.levels[0], active=torch.zeros_like(disturbed.levels[0].active))
-    motion = replace(disturbed, levels=(still,))
-    registered = register_parts(motion, view.rgb, view.depth, view.instances, scene.camera)
-    torch.testing.assert_close(registered.points, motion.points)
-    torch.testing.assert_close(registered.levels[0].pivots, still.pivots)
+    found = recording.register(replace(disturbed, levels=(still,)), MotionConfig())
+    assert not bool(found.levels[0].active.any())
 
 
-def test_without_depth_nothing_changes(scene: SyntheticScene, view: SyntheticView, disturbed: SceneMotion) -> None:
-    unknown = torch.zeros_like(view.depth)
-    assert register_parts(disturbed, view.rgb, unknown, view.instances, scene.camera) is disturbed
+def test_without_depth_there_is_no_recording(scene: SyntheticScene, view: SyntheticView) -> None:
+    assert Recording.of(view.rgb, torch.zeros_like(view.depth), view.instances, scene.camera) is None
 
 
 def test_depth_of_few_pixels_changes_nothing(
@@ -87,6 +126,6 @@ def test_depth_of_few_pixels_changes_nothing(
 ) -> None:
     sparse = torch.zeros_like(view.depth)
     sparse[:, ::8, ::8] = view.depth[:, ::8, ::8]  # no normals
-    registered = register_parts(disturbed, view.rgb, sparse, view.instances, scene.camera)
-    torch.testing.assert_close(registered.points, disturbed.points)
-    torch.testing.assert_close(registered.levels[0].displacements, disturbed.levels[0].displacements)
+    recording = Recording.of(view.rgb, sparse, view.instances, scene.camera)
+    assert recording is not None
+    assert recording.register(disturbed, MotionConfig()) is disturbed

@@ -43,7 +43,7 @@ def test_results_of_other_code_are_not_found(tmp_path: Path, monkeypatch: pytest
     compute = Counter()
     cache = open_cache(str(tmp_path), RGB)
     cache.get("depth", "plane", {}, compute)
-    monkeypatch.setattr(cache_module, "_code_digest", lambda: "newer")
+    monkeypatch.setattr(cache_module, "code_digest", lambda folder: "newer")
     cache.get("depth", "plane", {}, compute)
     assert compute.calls == 2
 

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_msdyn.priors.masks import empty_scene, moving_instances, temporal_median
+from lerobot_msdyn.priors.masks import moving_instances, temporal_median
 
 
 def overlap(found: Tensor, truth: Tensor) -> float:
@@ -28,16 +28,6 @@ def test_a_block_is_found_also_while_it_rests(sliding) -> None:
     assert instances.max() == 1
     for frame in (0, 4, 12, 18, 25, 29):
         assert overlap(instances[frame] > 0, sliding.mask[frame]) > 0.75, frame
-
-
-def test_the_empty_scene_is_clean_of_what_rested_in_it(sliding) -> None:
-    median, _ = temporal_median(sliding.rgb)
-    clean = empty_scene(sliding.rgb, sliding.mask.to(torch.uint8), median)
-    seen = (~sliding.mask).sum(0).numpy() > 8
-    difference = np.abs(clean.numpy().astype(float) - sliding.empty).mean(-1)
-    assert np.quantile(difference[seen], 0.98) < 4
-    always = sliding.mask.to(torch.uint8).amin(0).bool()
-    assert (clean[always] == median[always]).all()
 
 
 def test_two_things_keep_their_numbers(sliding) -> None:

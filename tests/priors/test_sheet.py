@@ -16,7 +16,7 @@ def priors_of(view: View, depth: torch.Tensor) -> Priors:
     instances[:, 10:20, 10:20] = 1
     visible = torch.arange(frames)[None] < frames // 2
     tracks = PointTracks(torch.full((1, frames, 2), 15.0), visible, visible.float(), torch.ones(1, dtype=torch.int64))
-    return Priors(depth, instances, view.rgb[0], tracks, True, {"masks": {"provider": "change"}})
+    return Priors(depth, instances, tracks, True, {"masks": {"provider": "change"}})
 
 
 def test_every_camera_has_four_rows_of_pictures(sliding) -> None:

@@ -1,0 +1,41 @@
+"""The video against points and motions: true motions cost least, alignment finds back to them."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+
+from lerobot_msdyn.motion.alignment import Sightings, Video, align
+from lerobot_msdyn.motion.regroup import Grouping
+
+
+def shifted(truth: Grouping, video: Video) -> Grouping:
+    """Every third frame some pixels off."""
+    motions = truth.motions.clone()
+    motions[:, 1::3, :3, 3] += 1.5 * video.pixel_m
+    return replace(truth, motions=motions)
+
+
+def test_true_motions_cost_least(
+    video: Video, points: Sightings, truth: Grouping, cost: Callable[[Grouping], float]
+) -> None:
+    assert cost(truth) < 0.9 * cost(shifted(truth, video))
+
+
+def test_alignment_takes_out_most_of_a_small_shift(
+    video: Video, points: Sightings, truth: Grouping, cost: Callable[[Grouping], float]
+) -> None:
+    off = shifted(truth, video)
+    found = off
+    for _ in range(3):
+        motions = align(video, points, truth.part, found.motions, off.motions)
+        found = replace(off, motions=motions)
+    best, worst = cost(truth), cost(off)
+    assert cost(found) - best < 0.5 * (worst - best)
+
+
+def test_sightings_lie_on_what_moves(video: Video, points: Sightings) -> None:
+    assert bool((points.instance > 0).all())
+    away = points.xyz - video.camera.world_from_camera[points.frame, :3, 3]
+    assert bool(((away * points.normals).sum(-1) < 0).all())
+    torch.testing.assert_close(points.normals.norm(dim=-1), torch.ones(len(points)))
