@@ -24,7 +24,6 @@ _HOMES = {
     "load_recipe": "cli",
     "load_scene": "scene",
     "open_source": "episode",
-    "perturb": "perturbation",
     "rasterize": "render",
     "read_episode": "episode",
     "reconstruct": "pipeline",

@@ -23,7 +23,6 @@ NAMES = [
     "load_recipe",
     "load_scene",
     "open_source",
-    "perturb",
     "rasterize",
     "read_episode",
     "reconstruct",
