@@ -30,4 +30,4 @@ lint: setup
 	$(BIN)/mypy
 
 clean:
-	rm -rf $(VENV) .tools demo_out
+	rm -rf $(VENV) .tools demo_out example_out

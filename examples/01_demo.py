@@ -46,20 +46,8 @@ def main() -> None:
     """Run the demo."""
     begin = time.perf_counter()
     shutil.rmtree(OUT, ignore_errors=True)
-    run(
-        "lerobot_msdyn.synthetic",
-        "--out",
-        str(OUT / "desk"),
-        "--kind",
-        "push",
-        "--episodes",
-        "2",
-        "--depth",
-        "--width",
-        "320",
-        "--height",
-        "240",
-    )
+    size = ["--width", "320", "--height", "240"]
+    run("lerobot_msdyn.synthetic", "--out", str(OUT / "desk"), "--kind", "push", "--episodes", "2", "--depth", *size)
     run("lerobot_msdyn.augment", "--repo", "local/desk", "--root", str(OUT / "desk"), "--recipe", "quick")
 
     source = LeRobotDataset("local/desk", root=OUT / "desk", video_backend="pyav")

@@ -315,6 +315,8 @@ class Recipe:
     include_source: bool = True
     # Whether recorded depth of a re-rendered camera is rendered as well; else it is copied, and shows the old view.
     render_depth: bool = True
+    # Whether the reconstructed scenes are kept in the output, for training on views of them (docs/scenes.md).
+    save_scenes: bool = False
     # Seed of every random choice; together with the episode and the variant it fixes the result.
     seed: int = 0
     # auto, cpu or cuda.
@@ -414,6 +416,38 @@ class EvaluateConfig(Recipe):
     depth: str = "recorded"
 
 
+@dataclass
+class ViewerConfig(Recipe):
+    """`python -m lerobot_msdyn.viewer`: look at an episode, its scene and its new views in Rerun."""
+
+    # Source dataset (alias: --repo).
+    repo_id: str = ""
+    # Exact folder of the source dataset; default: LeRobot's home, then the hub.
+    root: Path | None = None
+    # The episode to show.
+    episode: int = 0
+    # Output folder of `augment --save_scenes true`; without it the episode is fitted first.
+    scenes: Path | None = None
+    # A .rrd file to write instead of opening a window.
+    save: Path | None = None
+
+
+@dataclass
+class MixedViewsConfig:
+    """`lerobot_msdyn.training`: which samples are seen from elsewhere while a policy is trained (docs/training.md)."""
+
+    # Output folder of `augment --save_scenes true`.
+    scenes: Path = Path()
+    # Share of the samples that are seen from elsewhere.
+    probability: float = 0.5
+    # A recipe, by file or name, whose perturbation is drawn; default: the one of the run that saved the scenes.
+    perturbation: str | None = None
+    # Seed of every random choice; together with the epoch and the sample's index it fixes the result.
+    seed: int = 0
+    # Memory for the scenes that are kept loaded, in MB, in each data loading worker.
+    memory_mb: float = 1024.0
+
+
 def problems(config: object, prefix: str = "") -> list[str]:
     """One line per value that is out of range, over all nested fields; `config` is any of the classes here."""
     lines = []
@@ -494,6 +528,7 @@ _RANGES: dict[str, tuple[tuple[str, float, float], ...]] = {
     "Recipe": _RECIPE_RANGES,
     "AugmentConfig": _RECIPE_RANGES,
     "EvaluateConfig": _RECIPE_RANGES,
+    "ViewerConfig": _RECIPE_RANGES,
     "PriorsCommandConfig": (*_RECIPE_RANGES, ("columns", 1, 100)),
     "CameraConfig": (("horizontal_fov_deg", 5, 170), ("height_m", 0.01, 100), ("tilt_deg", 1, 90)),
     "SceneConfig": (
@@ -522,6 +557,7 @@ _RANGES: dict[str, tuple[tuple[str, float, float], ...]] = {
         ("held_out_frames", 0, 1000),
         ("patience", 1, 1_000_000),
     ),
+    "MixedViewsConfig": (("probability", 0, 1), ("seed", 0, 2**32 - 1), ("memory_mb", 0, _ANY)),
     "GateConfig": (
         ("min_expected_db", 0, 60),
         ("max_track_px", 0, _ANY),

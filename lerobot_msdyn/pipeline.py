@@ -11,6 +11,7 @@ import numpy as np
 from lerobot.datasets import LeRobotDatasetMetadata
 from torch import Tensor
 
+from lerobot_msdyn import saved
 from lerobot_msdyn.background import empty_scene
 from lerobot_msdyn.bounds import NewCameras, new_cameras
 from lerobot_msdyn.cameras import concatenated, read_calibration
@@ -26,6 +27,7 @@ from lerobot_msdyn.provenance import SOURCE_VARIANT, Provenance, camera_pose, me
 from lerobot_msdyn.quality.verdict import judge, reasons, record
 from lerobot_msdyn.quality.witness import Witness, witness
 from lerobot_msdyn.render.threads import torch_on_one_thread
+from lerobot_msdyn.saved import SavedScene, SceneSource
 from lerobot_msdyn.shared import (
     SharedBackground,
     adapted,
@@ -91,6 +93,9 @@ def augment_episode(
         make_episode = functools.partial(_rendered, source, index, variant, recipe, output, scenes, other)
         new.append(kept.keep(f"variant_{variant:02d}", make_episode))
         progress("", 0.5 / recipe.variants)
+    if recipe.save_scenes:
+        for key, scene in scenes.items():
+            saved.save(to_saved(scene, SceneSource(source.repo_id, index, key, source.fps)), output.scenes)
     return new
 
 
@@ -111,6 +116,12 @@ def _rendered(
     dropped = gate["rejected"][-1] if len(gate["rejected"]) > recipe.gate.redraws else ""
     new = _staged(source, index, variant, recipe, output, scenes, found, gate, dropped=dropped)
     return replace(new, seconds=seconds)
+
+
+def to_saved(scene: Reconstruction, source: SceneSource) -> SavedScene:
+    """What of a reconstruction is kept."""
+    windows = tuple(result.scene for result in scene.results)
+    return SavedScene(source, windows, scene.starts, scene.camera, scene.metric, scene.distance, scene.provenance)
 
 
 def _accepted(

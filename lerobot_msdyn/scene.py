@@ -154,6 +154,20 @@ class DynamicScene:
             moving=torch.cat((torch.zeros_like(static.opacity_logits), torch.ones_like(moving.opacity_logits))),
         )
 
+    def tensors(self) -> dict[str, Tensor]:
+        """All that the scene is made of, by the names of its file."""
+        tensors: dict[str, Tensor] = {}
+        if self.shading is not None:
+            tensors |= {f"shading.{item.name}": getattr(self.shading, item.name) for item in fields(Shading)}
+        if self.overlay is not None:
+            tensors |= {f"overlay.{item.name}": getattr(self.overlay, item.name) for item in fields(Overlay)}
+        for name, part in (("static", self.static), ("moving", self.moving)):
+            tensors |= {f"{name}.{item.name}": getattr(part, item.name) for item in fields(part)}
+        for i, level in enumerate(self.levels):
+            tensors |= {f"levels.{i}.{item.name}": getattr(level, item.name) for item in fields(level)}
+            tensors |= {f"levels.{i}.indices": self.indices[i], f"levels.{i}.logits": self.logits[i]}
+        return tensors
+
     def _colours(
         self,
         frames: Int[Tensor, " b"],
@@ -182,16 +196,6 @@ def isotropic(gaussians: Gaussians) -> Gaussians:
 
 def save_scene(scene: DynamicScene, path: Path) -> None:
     """Write a scene as one safetensors file, atomically."""
-    tensors: dict[str, Tensor] = {}
-    if scene.shading is not None:
-        tensors |= {f"shading.{item.name}": getattr(scene.shading, item.name) for item in fields(Shading)}
-    if scene.overlay is not None:
-        tensors |= {f"overlay.{item.name}": getattr(scene.overlay, item.name) for item in fields(Overlay)}
-    for name, part in (("static", scene.static), ("moving", scene.moving)):
-        tensors |= {f"{name}.{item.name}": getattr(part, item.name) for item in fields(part)}
-    for i, level in enumerate(scene.levels):
-        tensors |= {f"levels.{i}.{item.name}": getattr(level, item.name) for item in fields(level)}
-        tensors |= {f"levels.{i}.indices": scene.indices[i], f"levels.{i}.logits": scene.logits[i]}
     names = {kind: name for name, kind in LEVEL_KINDS.items()}
     header = {
         "schema": SCHEMA_VERSION,
@@ -201,7 +205,7 @@ def save_scene(scene: DynamicScene, path: Path) -> None:
     }
     partial = path.with_name(path.name + ".partial")
     save_file(
-        {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()},
+        {name: tensor.detach().cpu().contiguous() for name, tensor in scene.tensors().items()},
         partial,
         metadata={"lerobot_msdyn": json.dumps(header)},
     )

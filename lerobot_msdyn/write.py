@@ -5,6 +5,7 @@ complete.
 """
 
 import copy
+import os
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,6 +21,7 @@ from lerobot.datasets.io_utils import write_info, write_tasks
 from lerobot.datasets.utils import update_chunk_file_indices
 from lerobot.datasets.video_utils import concatenate_video_files, get_video_duration_in_s
 
+from lerobot_msdyn import saved
 from lerobot_msdyn.card import licence_of, write_card
 from lerobot_msdyn.checks import PICTURE_DTYPES, TEXT_DTYPES
 from lerobot_msdyn.copies import stage_copies
@@ -69,6 +71,7 @@ class OutputDataset:
         self.staging = staging or Staging(root)
         if staging is None:
             self.staging.clear()
+        self.scenes = self.staging.folder / "scenes"
 
     def __enter__(self) -> "OutputDataset":
         return self
@@ -145,6 +148,8 @@ class OutputDataset:
             for number, episode in enumerate(episodes):
                 if episode.masks:
                     write_unseen(folder, number, episode.masks)
+            if self.scenes.is_dir():
+                shutil.copytree(self.scenes, folder / saved.FOLDER, copy_function=os.link)
             write_card(folder, self.repo_id, licence_of(self.source.root))
             report(folder)
             if self.root.exists():

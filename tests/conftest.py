@@ -8,6 +8,7 @@ import pytest
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 
+from lerobot_msdyn import augment
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.dataset import write_dataset
 
@@ -26,6 +27,28 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("desk") / "desk"
     write_dataset(_scenes(3), "local/desk", root, cameras=["front", "side"], depth=True)
     return root
+
+
+@pytest.fixture(scope="session")
+def desk_scenes(desk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The output of `augment --save_scenes true` on two of the three episodes of `desk`, front camera."""
+    out = tmp_path_factory.mktemp("desk_scenes") / "new"
+    flags = {
+        "repo": "local/desk",
+        "root": desk,
+        "new_root": out,
+        "episodes": "[0,1]",
+        "cameras": "[front]",
+        "variants": 1,
+        "perturbation.azimuth_deg": 8,
+        "save_scenes": "true",
+        "fit.steps": 8,
+        "fit.window_frames": 6,
+        "scene.moving_gaussians": 500,
+        "scene.moving_frames": 4,
+    }
+    assert augment.run([f"--{name}={value}" for name, value in flags.items()]) == 0
+    return out
 
 
 @pytest.fixture(scope="session")

@@ -139,6 +139,8 @@ def test_a_long_video_is_fitted_in_windows(pushed: View) -> None:
 
 def test_depth_is_rendered_where_it_is_recorded_and_wanted(desk: Path) -> None:
     source, key = open_source("local/desk", desk), "observation.images.front"
-    picture = Picture(np.zeros((HEIGHT, WIDTH, 3), np.uint8), np.ones((HEIGHT, WIDTH), np.float32))
+    picture = Picture(
+        np.zeros((HEIGHT, WIDTH, 3), np.uint8), np.ones((HEIGHT, WIDTH), np.float32), np.zeros((HEIGHT, WIDTH), bool)
+    )
     for depth, features in ((True, [key, f"{key}_depth"]), (False, [key])):
         assert [list(found) for found in by_feature(source, {key: iter([picture])}, depth=depth)] == [features]

@@ -1,0 +1,6 @@
+"""Views of saved scenes, drawn while a policy is trained (docs/training.md)."""
+
+from lerobot_msdyn.training.mixed import MixedViews
+from lerobot_msdyn.training.streamed import MixedStream
+
+__all__ = ["MixedStream", "MixedViews"]

@@ -1,0 +1,75 @@
+"""A streaming LeRobot dataset, some of whose samples are seen from elsewhere."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lerobot_msdyn.config import MixedViewsConfig, PerturbationConfig
+from lerobot_msdyn.training.cache import Scenes
+from lerobot_msdyn.training.mixer import ViewMixer, colour_sample, depth_sample
+
+
+class MixedStream(torch.utils.data.IterableDataset):
+    """As `MixedViews`, around a StreamingLeRobotDataset.
+
+    The scenes must be on this machine, and recorded frames that are replaced have been decoded already: nothing is
+    saved by streaming but the disk for the recording.
+    """
+
+    def __init__(
+        self,
+        dataset: Any,
+        scenes: str | os.PathLike[str] | Scenes,
+        probability: float = MixedViewsConfig.probability,
+        perturbation: PerturbationConfig | None = None,
+        seed: int = MixedViewsConfig.seed,
+        *,
+        memory_mb: float = MixedViewsConfig.memory_mb,
+    ) -> None:
+        """Arguments and errors as in `MixedViews`, but `dataset` is a StreamingLeRobotDataset."""
+        self.dataset = dataset
+        folder = scenes if not isinstance(scenes, str | os.PathLike) else Path(scenes)
+        self.mixer = ViewMixer(
+            dataset.meta,
+            dataset.episodes,
+            dict(dataset.delta_indices or {}),
+            folder,
+            probability,
+            perturbation,
+            seed,
+            memory_mb,
+        )
+
+    def __getattr__(self, name: str) -> Any:
+        """All else is the wrapped dataset's."""
+        if name == "dataset":  # asked for while a copy is being unpickled
+            raise AttributeError(name)
+        return getattr(self.dataset, name)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Tell it, and workers that run already, which epoch it is."""
+        self.mixer.set_epoch(epoch)
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        for item in self.dataset:
+            yield self._mixed(item)
+
+    def _mixed(self, item: dict[str, Any]) -> dict[str, Any]:
+        """A sample, seen from elsewhere if its turn has come."""
+        episode, position, index = (int(item[key]) for key in ("episode_index", "frame_index", "index"))
+        pictures = self.mixer.draw(episode, position, index, self.mixer.replaced(episode, index))
+        for key, found in pictures.items():
+            windowed = item[key].ndim == 4
+            if key in self.dataset.meta.depth_keys:
+                unit = self.dataset.depth_output_unit
+                item[key] = depth_sample(found, self.dataset.meta, key, unit, windowed=windowed)
+            else:
+                image, transforms = (
+                    colour_sample(found, item[key].dtype, windowed=windowed),
+                    self.dataset.image_transforms,
+                )
+                item[key] = image if transforms is None else transforms(image)
+        return item

@@ -1,0 +1,260 @@
+"""Command line: look at an episode, its priors, its scene and its new views in Rerun, on one timeline.
+
+python -m lerobot_msdyn.viewer --repo local/ds --episode 0 [--scenes FOLDER] [--save FILE.rrd]
+"""
+
+import logging
+import sys
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lerobot_msdyn.cli import EXIT_OK, parse_config, run_command
+from lerobot_msdyn.config import ViewerConfig
+from lerobot_msdyn.errors import ConfigError, DatasetError, MsdynError, OutputError
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+    from lerobot_msdyn.cameras import CameraTrack
+    from lerobot_msdyn.episode import View
+    from lerobot_msdyn.priors import Priors
+    from lerobot_msdyn.saved import SavedScene
+
+logger = logging.getLogger(__name__)
+
+COMMAND = "python -m lerobot_msdyn.viewer"
+ALIASES = {"repo": "repo_id"}
+FRUSTUM_SHARE = 0.15  # length of a drawn frustum, of the look-at distance
+GOLDEN = 0.618034  # of the circle of hues, from one index to the next
+
+
+def run(arguments: list[str]) -> int:
+    """Show or save an episode; returns the exit code."""
+    config = parse_config(ViewerConfig, arguments, ALIASES, command=COMMAND)
+    if not config.repo_id:
+        raise ConfigError(f"which dataset? {COMMAND} --repo NAME [--root FOLDER] (see --help)")
+    try:
+        import rerun as rr
+    except ImportError as error:
+        raise MsdynError("Rerun is not installed; get it with: pip install 'lerobot_msdyn[viz]'") from error
+    if config.save is not None and not config.save.parent.is_dir():
+        raise OutputError(f"--save {config.save}: no folder {config.save.parent}")
+    stream = rr.RecordingStream("lerobot_msdyn")
+    if config.save is None:
+        stream.spawn()
+    else:
+        stream.save(config.save)
+    show_episode(config, stream)
+    stream.flush()
+    if config.save is not None:
+        sys.stdout.write(
+            f"{config.save}  {config.save.stat().st_size / 1e6:.0f} MB; open it with: rerun {config.save}\n"
+        )
+    return EXIT_OK
+
+
+def show_episode(config: ViewerConfig, stream: "rr.RecordingStream") -> None:
+    """Log one episode, camera by camera.
+
+    Raises:
+        DatasetError: there is no such dataset or episode, or the scenes hold none of it.
+    """
+    from lerobot_msdyn import saved
+    from lerobot_msdyn.episode import open_source, read_episode, select_cameras, select_episodes, shrink
+    from lerobot_msdyn.priors import estimate_priors
+
+    source = open_source(config.repo_id, config.root)
+    (index,) = select_episodes(source, [config.episode])
+    cameras = select_cameras(source, config.cameras)
+    known = None if config.scenes is None else saved.list_scenes(config.scenes).get(index, {})
+    if known is not None:
+        cameras = [key for key in cameras if key in known]
+        if not cameras:
+            raise DatasetError(f"{config.scenes}: no saved scene of episode {index} of {source.repo_id}")
+    episode = read_episode(source, index, cameras, config.camera, recorded_depth=config.priors.depth != "plane")
+    small = {key: shrink(view, config.fit.max_width) for key, view in episode.views.items()}
+    for key, view in episode.views.items():
+        others = [other for name, other in small.items() if name != key]
+        priors = estimate_priors(
+            small[key], config.priors, config.camera, others=others, episode=index, key=key, device=config.device
+        )
+        scene = _reconstructed(config, source, index, key, episode.views) if known is None else saved.load(known[key])
+        log = _Log(stream, key.rsplit(".", 1)[-1], episode.fps)
+        _log_source(log, view, priors)
+        _log_gaussians(log, scene)
+        _log_camera(log, "source", scene.camera, scene.distance)
+        for variant in range(config.variants):
+            _log_new_view(log, config, scene, variant)
+    stream.send_blueprint(_blueprint([key.rsplit(".", 1)[-1] for key in cameras], config.variants))
+
+
+def _reconstructed(config: ViewerConfig, source: Any, index: int, key: str, views: dict[str, "View"]) -> "SavedScene":
+    """The scene of a camera, fitted now."""
+    from lerobot_msdyn.pipeline import reconstruct, to_saved
+    from lerobot_msdyn.saved import SceneSource
+
+    others = [other for name, other in views.items() if name != key]
+    logger.info("fitting %s; saved scenes are shown at once (--scenes)", key)
+    found = reconstruct(views[key], config, others=others, episode=index, key=key)
+    return to_saved(found, SceneSource(source.repo_id, index, key, source.fps))
+
+
+class _Log:
+    """Entities of one camera, by frame."""
+
+    def __init__(self, stream: "rr.RecordingStream", root: str, fps: float) -> None:
+        self.stream, self.root, self.fps = stream, root, fps
+
+    def at(self, frame: int, path: str, what: Any) -> None:
+        self.stream.set_time("frame", sequence=frame)
+        self.stream.set_time("time", duration=frame / self.fps)
+        self.stream.log(f"{self.root}/{path}", what)
+
+    def always(self, path: str, what: Any) -> None:
+        self.stream.log(f"{self.root}/{path}", what, static=True)
+
+
+def _log_source(log: _Log, view: "View", priors: "Priors") -> None:
+    """The video and what was known about it before the fit."""
+    import rerun as rr
+
+    tracks = priors.tracks
+    colours = _colours(tracks.instance.numpy())
+    for frame in range(len(view.rgb)):
+        log.at(frame, "source/video", rr.Image(view.rgb[frame].numpy()).compress(jpeg_quality=90))
+        log.at(frame, "priors/instances/masks", rr.SegmentationImage(priors.instances[frame].numpy()))
+        log.at(frame, "priors/depth", rr.DepthImage(priors.depth[frame].numpy(), meter=1.0))
+        seen = tracks.visible[:, frame].numpy()
+        log.at(
+            frame, "priors/instances/tracks",
+            rr.Points2D(tracks.xy[:, frame].numpy()[seen], colors=colours[seen], radii=1.0),
+        )  # fmt: skip
+
+
+def _log_gaussians(log: _Log, scene: "SavedScene") -> None:
+    """The static set once per window; the moving one at every frame, in its own colours and in those of its levels."""
+    import rerun as rr
+
+    from lerobot_msdyn.ply import gaussians_at
+
+    for start, window in zip(scene.starts, scene.windows, strict=True):
+        static, still = window.static, len(window.static)
+        log.at(start, "world/static", _points(static.means, static.rgb, static.scales))
+        by_level = {
+            f"level_{number}": _colours(index.gather(1, logit.argmax(1, keepdim=True))[:, 0].numpy())
+            for number, (index, logit) in enumerate(zip(window.indices, window.logits, strict=True))
+        }
+        for frame in range(window.frames):
+            moving = gaussians_at(replace(window, overlay=None), frame).select(slice(still, None))
+            log.at(start + frame, "world/moving/points", _points(moving.means, moving.rgb, moving.scales))
+            log.at(
+                start + frame, "world/moving/ellipsoids",
+                rr.Ellipsoids3D(
+                    centers=moving.means.numpy(),
+                    half_sizes=moving.scales.numpy(),
+                    quaternions=moving.quats[:, [1, 2, 3, 0]].numpy(),
+                    colors=_bytes(moving.rgb),
+                    fill_mode="solid",
+                ),
+            )  # fmt: skip
+            if window.overlay is not None:
+                patch = window.overlay.patch(frame, still + len(moving))
+                log.at(start + frame, "world/overlay", _points(patch.means, patch.rgb, patch.log_scales.exp()))
+            for name, colours in by_level.items():
+                log.at(start + frame, f"world/motion/{name}", rr.Points3D(moving.means.numpy(), colors=colours))
+
+
+def _points(means: Any, rgb: Any, scales: Any) -> Any:
+    import rerun as rr
+
+    return rr.Points3D(means.numpy(), colors=_bytes(rgb), radii=scales.median(dim=-1).values.numpy())
+
+
+def _log_camera(log: _Log, name: str, camera: "CameraTrack", distance: float) -> None:
+    """A frustum; a camera that stands still is logged once."""
+    import rerun as rr
+
+    for frame in range(1 if camera.is_static else len(camera)):
+        pose, intrinsics = camera.world_from_camera[frame].numpy(), camera.intrinsics[frame].numpy()
+        path = f"world/cameras/{name}"
+        log.at(frame, path, rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
+        log.at(
+            frame, path,
+            rr.Pinhole(
+                image_from_camera=intrinsics,
+                width=camera.width,
+                height=camera.height,
+                image_plane_distance=FRUSTUM_SHARE * distance,
+            ),
+        )  # fmt: skip
+
+
+def _log_new_view(log: _Log, config: ViewerConfig, scene: "SavedScene", variant: int) -> None:
+    """One new camera as drawn by the recipe (before any bound), its pictures, and how opaque they are."""
+    import rerun as rr
+    import torch
+
+    from lerobot_msdyn.perturbation import Viewpoint, amounts_of, draw, moved
+    from lerobot_msdyn.training.live import LiveScene
+
+    key, view = scene.source.camera, Viewpoint(scene.camera, scene.distance, scene.metric)
+    share = draw(config.perturbation, config.seed, scene.source.episode, variant, len(scene))
+    amounts = amounts_of(config.perturbation, share, view, variant)
+    camera = moved(config.perturbation, {key: view}, {key: amounts})[key]
+    _log_camera(log, f"new_{variant}", camera, scene.distance)
+    live = LiveScene(scene)
+    for frame in range(len(scene)):
+        at = torch.tensor([frame])
+        pictures = live.draw(camera.select([frame]), at)
+        log.at(frame, f"new_{variant}/rendered", rr.Image(pictures.rgb[0].transpose(1, 2, 0)).compress(jpeg_quality=90))
+        log.at(frame, f"new_{variant}/coverage", rr.Image((255 * pictures.alpha[0]).round().astype(np.uint8)))
+
+
+def _colours(indices: np.ndarray) -> np.ndarray:
+    """A colour per index, far apart for neighbouring ones (golden angle), uint8 [n, 3]."""
+    import cv2
+
+    hues = (indices.astype(np.int64) * GOLDEN % 1.0 * 180).astype(np.uint8)
+    hsv = np.stack((hues, np.full_like(hues, 200), np.full_like(hues, 240)), axis=-1)
+    return np.asarray(cv2.cvtColor(hsv[None], cv2.COLOR_HSV2RGB)[0])
+
+
+def _bytes(rgb: Any) -> np.ndarray:
+    return np.asarray((rgb.clamp(0, 1) * 255).round().numpy().astype(np.uint8))
+
+
+def _blueprint(cameras: list[str], variants: int) -> Any:
+    """Per camera the scene beside its pictures."""
+    import rerun.blueprint as rrb
+
+    tabs = []
+    for name in cameras:
+        pictures = [
+            rrb.Spatial2DView(origin=f"{name}/{path}", name=path)
+            for path in ("source/video", "priors/instances", "priors/depth")
+        ] + [
+            rrb.Spatial2DView(origin=f"{name}/new_{variant}/{path}", name=f"new {variant}: {path}")
+            for variant in range(variants)
+            for path in ("rendered", "coverage")
+        ]
+        shown = [f"+ /{name}/world/**", f"- /{name}/world/motion/**", f"- /{name}/world/moving/ellipsoids"]
+        space = rrb.Tabs(
+            rrb.Spatial3DView(origin=f"{name}/world", name="scene", contents=shown),
+            rrb.Spatial3DView(origin=f"{name}/world", name="levels of motion", contents=[f"+ /{name}/world/motion/**"]),
+            rrb.Spatial3DView(
+                origin=f"{name}/world", name="ellipsoids", contents=[f"+ /{name}/world/moving/ellipsoids"]
+            ),
+        )
+        tabs.append(rrb.Horizontal(space, rrb.Grid(*pictures), column_shares=[3, 4], name=name))
+    return rrb.Blueprint(rrb.Tabs(*tabs), rrb.TimePanel(state="collapsed"))
+
+
+def main() -> None:
+    """Entry point."""
+    run_command(run)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,98 @@
+"""Frames that are drawn for training are those that the renderer draws."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from lerobot_msdyn import saved
+from lerobot_msdyn.geometry import axis_angle_to_matrix, se3
+from lerobot_msdyn.motion.bases import level_from_motions
+from lerobot_msdyn.motion.field import fit_field
+from lerobot_msdyn.perturbation import orbit_offset
+from lerobot_msdyn.rendering import draw
+from lerobot_msdyn.saved import SavedScene
+from lerobot_msdyn.scene import DynamicScene
+from lerobot_msdyn.training.live import LiveScene, filled
+
+
+@pytest.fixture
+def scene(desk_scenes: Path) -> SavedScene:
+    return saved.load(saved.list_scenes(desk_scenes)[0]["observation.images.front"])
+
+
+def turning(scene: DynamicScene, bases: int = 3) -> DynamicScene:
+    """The scene with two levels of random motions, in one of which opposite turns cancel out."""
+    generator = torch.Generator().manual_seed(0)
+    count = len(scene.moving)
+
+    def level(size: float) -> object:
+        turns = size * torch.randn(bases, scene.frames, 3, generator=generator)
+        turns[1:2, 1:] = torch.tensor([0.0, 0.0, torch.pi])
+        shifts = 0.1 * torch.randn(bases, scene.frames, 3, generator=generator)
+        return level_from_motions(se3(axis_angle_to_matrix(turns), shifts), torch.randn(bases, 3, generator=generator))
+
+    indices = tuple(torch.randint(bases, (count, j), generator=generator) for j in (1, 2))
+    logits = tuple(torch.randn(count, j, generator=generator) for j in (1, 2))
+    slope = 0.3 * torch.randn(count, 4, 3, generator=generator)
+    return replace(
+        scene,
+        levels=(level(1.0), level(2.0)),
+        indices=indices,
+        logits=logits,
+        moving=replace(scene.moving, sh=slope),
+    )
+
+
+def with_field(scene: DynamicScene) -> DynamicScene:
+    """The scene with a deformation field instead of bases."""
+    means, count = scene.moving.means, len(scene.moving)
+    if count == 0:
+        return scene
+    tracks = means[:20, None] + 0.1 * torch.arange(scene.frames)[None, :, None]
+    field = fit_field(means[:20], tracks, torch.ones(20, scene.frames), steps=5)
+    return replace(scene, levels=(field,), indices=(torch.zeros(count, 1).long(),), logits=(torch.zeros(count, 1),))
+
+
+@pytest.mark.parametrize("change", [lambda scene: scene, turning, with_field], ids=["fitted", "turning", "field"])
+def test_the_same_picture_as_the_renderer_draws(scene: SavedScene, change: object) -> None:
+    scene = replace(scene, windows=tuple(change(window) for window in scene.windows))
+    frames = torch.tensor([2, 8, 9])
+    recorded = scene.camera.select(frames)
+    offset = orbit_offset(8.0, -4.0, scene.distance)
+    camera = replace(recorded, world_from_camera=recorded.world_from_camera @ offset)
+    live = LiveScene(scene)
+    for _ in range(2):  # buffers are used again
+        found = live.draw(camera, frames)
+    for i, frame in enumerate(frames.tolist()):
+        number = int(frame >= 6)
+        with torch.no_grad():
+            expected = draw(scene.windows[number], camera.select([i]), torch.tensor([frame - scene.starts[number]]))
+        known = expected.alpha[0].numpy() >= 0.5
+        rgb = 255 * expected.rgb[0].clamp(0, 1).permute(2, 0, 1).numpy()
+        assert np.abs(found.rgb[i].astype(float) - rgb)[:, known].max() < 1
+        assert np.abs(found.depth[i] - expected.depth[0].numpy())[known].max() < 1e-4
+        assert (found.depth[i][~known] == 0).all()
+        np.testing.assert_allclose(found.alpha[i], expected.alpha[0].numpy(), atol=1e-4)
+
+
+def test_depth_without_true_scale_is_unknown(scene: SavedScene) -> None:
+    live = LiveScene(replace(scene, metric=False))
+    assert (live.draw(scene.camera.select([0]), torch.tensor([0])).depth == 0).all()
+
+
+def test_holes_take_the_colour_around_them() -> None:
+    rgb = np.full((3, 40, 60), 100, np.uint8)
+    rgb[:, :, 30:] = 200
+    known = np.ones((40, 60), bool)
+    known[10:30, 5:15] = False
+    rgb[:, ~known] = 0
+    found = filled(rgb, known)
+    assert np.abs(found[:, ~known].astype(int) - 100).max() < 15
+    assert (found[:, known] == rgb[:, known]).all()
+    assert (filled(rgb, np.zeros_like(known)) == rgb).all(), "with nothing known nothing is invented"
+    single = np.zeros_like(known)
+    single[20, 30] = True
+    assert np.abs(filled(rgb, single)[:, ~single].astype(int) - 200).max() < 5
