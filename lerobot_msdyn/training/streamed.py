@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from lerobot_msdyn.config import MixedViewsConfig, PerturbationConfig
-from lerobot_msdyn.training.cache import Scenes
+from lerobot_msdyn.training.scene_cache import Scenes
 from lerobot_msdyn.training.mixer import ViewMixer, colour_sample, depth_sample
 
 
