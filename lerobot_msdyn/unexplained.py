@@ -22,7 +22,7 @@ from lerobot_msdyn.scene import DynamicScene
 logger = logging.getLogger(__name__)
 
 COLOUR_ERROR = 0.06  # mean absolute difference of colours 0..1, over about a pixel, beyond which one is not explained
-DEPTH_ERROR = 0.02  # relative difference of depths beyond which it is not
+DEPTH_ERROR = 0.02  # relative difference of depths beyond which it is not, at least
 JUMP = 0.05  # relative step of depth to the surface in front, beyond which a pixel belongs to the one behind
 THICKNESS = 0.03  # share of the depth within which a Gaussian belongs to the recorded surface
 SCALE = 0.7  # of a pixel's Gaussian: its neighbours are drawn as well
@@ -35,7 +35,8 @@ def unexplained(scene: DynamicScene, view: View, priors: Priors, backend: str = 
 
     A pixel is unexplained where the drawn picture has another colour or depth than the recorded one. There the frame's
     own pixels are put at their recorded depth, for this frame alone, and Gaussians of the scene in front of that
-    surface or on it are not drawn. What lies behind it stays, and is seen past its edges from other cameras.
+    surface or on it are not drawn. What lies behind it stays, and is seen past its edges from other cameras. Depth only
+    contradicts the scene beyond what its provider may err by, and not at all where it is assumed.
 
     Args:
         scene: fitted, without an overlay.
@@ -43,14 +44,14 @@ def unexplained(scene: DynamicScene, view: View, priors: Priors, backend: str = 
         priors: its depth.
         backend: of the rasterizer.
     """
-    patches, still = [], None
+    patches, still, tolerance = [], None, depth_tolerance(priors)
     for frame in range(len(view.rgb)):
         camera, when = view.camera.select([frame]), torch.tensor([frame])
         depth = fill_depth(priors.depth[frame])
         if still is None or not view.camera.is_static:
             still = draw(_static_only(scene), camera, when, backend).depth[0]
         drawn = draw(scene, camera, when, backend)
-        wrong = _wrong(drawn, view.rgb[frame].float() / 255, depth)
+        wrong = _wrong(drawn, view.rgb[frame].float() / 255, depth, tolerance)
         taken = wrong & ~_behind_an_edge(depth.numpy(), still.numpy())
         patches.append(_patch(scene, view, depth, frame, wrong, taken, backend))
     overlay = packed(patches)
@@ -59,18 +60,27 @@ def unexplained(scene: DynamicScene, view: View, priors: Priors, backend: str = 
     return overlay
 
 
+def depth_tolerance(priors: Priors) -> float:
+    """Relative difference of depths beyond which a picture is wrong; infinite for depth that is only assumed."""
+    if priors.provenance.get("depth", {}).get("provider") == "plane":
+        return math.inf
+    return max(DEPTH_ERROR, priors.depth_error)
+
+
 def _static_only(scene: DynamicScene) -> DynamicScene:
     nothing = scene.moving.select(torch.zeros(0, dtype=torch.long))
     return DynamicScene(scene.static, nothing, (), (), (), scene.frames)
 
 
-def _wrong(drawn: Rendering, recorded: Float[Tensor, "h w 3"], depth: Float[Tensor, "h w"]) -> Bool[ndarray, "h w"]:
+def _wrong(
+    drawn: Rendering, recorded: Float[Tensor, "h w 3"], depth: Float[Tensor, "h w"], tolerance: float
+) -> Bool[ndarray, "h w"]:
     """Where a drawn picture has another colour or depth (m) than the recorded one, and the pixels beside."""
     difference = (drawn.rgb[0].clamp(0, 1) - recorded).abs().mean(-1).numpy()
     apart = (drawn.depth[0] / depth - 1).abs().numpy()
     moving = (drawn.moving[0] > 0.5).numpy()
     around = _blurred(difference * moving, _AROUND_PX) > ERROR_AROUND * _blurred(moving, _AROUND_PX)
-    wrong = (_blurred(difference, _SMOOTH_PX) > COLOUR_ERROR) | (apart > DEPTH_ERROR) | (moving & around)
+    wrong = (_blurred(difference, _SMOOTH_PX) > COLOUR_ERROR) | (apart > tolerance) | (moving & around)
     opened = cv2.morphologyEx(wrong.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
     return cv2.dilate(opened, np.ones((3, 3), np.uint8)) > 0
 
