@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -91,6 +92,15 @@ def test_files_that_are_not_what_their_names_say(root: Path) -> None:
             open_source("local/ds", root)
         path.write_bytes(good)
     check_metadata(root)
+
+
+def test_tasks_that_are_no_text(root: Path) -> None:
+    path = root / "meta" / "tasks.parquet"
+    table = pq.read_table(path)
+    for bad in ([float("nan")] * len(table), [3] * len(table)):
+        pq.write_table(table.set_column(table.column_names.index("task"), "task", pa.array(bad)), path)
+        with pytest.raises(DatasetError, match=r"expected a text and a task_index"):
+            check_metadata(root)
 
 
 def test_an_episode_table_that_lacks_a_column(root: Path) -> None:
