@@ -250,7 +250,7 @@ def _check_tasks(root: Path, total: int) -> None:
     texts = [
         column for column in table.columns if pa.types.is_string(column.type) or pa.types.is_large_string(column.type)
     ]
-    complete = sorted(map(str, indices)) == sorted(map(str, range(total)))
+    complete = len(indices) == total and sorted(map(str, indices)) == sorted(map(str, range(total)))
     if len(table.column_names) != 2 or len(texts) != 1 or not complete:
         raise DatasetError(
             f"{root / 'meta' / 'tasks.parquet'}: expected a text and a task_index from 0 to {total - 1} for each task, "

@@ -51,6 +51,7 @@ def test_real_metadata_is_fine(desk: Path, image_desk: Path) -> None:
         (["total_frames"], 10**12, "lengths are .* add up to .* 1000000000000"),
         (["total_episodes"], 2, "3 episodes, .*; expected 0 to 1"),
         (["total_tasks"], 7, r"tasks.parquet: expected .* from 0 to 6"),
+        (["total_tasks"], 10**12, r"tasks.parquet: expected .* from 0 to 999999999999"),
         (["data_path"], "../../../etc/{chunk_index}-{file_index}", "leaves the dataset's folder"),
         (["data_path"], "/etc/passwd", "leaves the dataset's folder"),
         (["data_path"], "{chunk_index.__class__.__mro__}", "is not one of chunk_index, file_index"),
