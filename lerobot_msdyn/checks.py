@@ -269,7 +269,7 @@ def _check_episodes(root: Path, info: dict[str, Any], video_keys: list[str]) -> 
     tables = [_read_table(regular_file(root, path.relative_to(root)), columns) for path in files]
     episodes = [value for table in tables for value in table["episode_index"].to_pylist()]
     lengths = [value for table in tables for value in table["length"].to_pylist()]
-    if episodes != list(range(info["total_episodes"])):
+    if len(episodes) != info["total_episodes"] or episodes != list(range(len(episodes))):
         raise DatasetError(
             f"{folder}: {len(episodes)} episodes, {_short(episodes)}; expected 0 to {info['total_episodes'] - 1}, as "
             "many as info.json's total_episodes"
