@@ -235,7 +235,7 @@ def reconstruct(
             key=key,
             device=recipe.device,
         )
-        fitted.append(_fit_window(shrink(window, recipe.fit.max_width), recipe, within, backgrounds, priors_of))
+        fitted.append(_fit_window(window, recipe, within, backgrounds, priors_of))
     results, known, distances, evidence, witnesses = zip(*fitted, strict=True)
     starts = tuple(start for start, _ in parts)
     camera = concatenated([part.camera for part in evidence]).resized(view.camera.width, view.camera.height)
@@ -253,6 +253,8 @@ def _fit_window(
 ) -> tuple[FitResult, Priors, float, Evidence, Witness]:
     """A fitted scene of one window, its priors, look-at distance (m), what was recorded, and how well that is met."""
     steps, settings = recipe.fit.steps, recipe.scene
+    recorded_width, view = view.rgb.shape[2], shrink(view, recipe.fit.max_width)
+    enlarged = recorded_width > view.rgb.shape[2]
     with torch_on_one_thread():
         shared = next((background for background in backgrounds if background.fits(view)), None)
         priors = priors_of(view, elsewhere=None if shared is None else shared.frames)
@@ -284,7 +286,8 @@ def _fit_window(
         seen = evidence_of(result.scene, view.camera, empty)
         said = witness(result.scene, view, priors, result.held_out)  # of frames that an overlay would show as recorded
         if settings.overlay:
-            result = replace(result, scene=replace(result.scene, overlay=unexplained(result.scene, view, priors)))
+            overlay = unexplained(result.scene, view, priors, enlarged=enlarged)
+            result = replace(result, scene=replace(result.scene, overlay=overlay))
     return result, priors, distance, seen, said
 
 

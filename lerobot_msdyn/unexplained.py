@@ -22,41 +22,54 @@ from lerobot_msdyn.scene import DynamicScene
 logger = logging.getLogger(__name__)
 
 COLOUR_ERROR = 0.06  # mean absolute difference of colours 0..1, over about a pixel, beyond which one is not explained
-DEPTH_ERROR = 0.02  # relative difference of depths beyond which it is not
+DEPTH_ERROR = 0.02  # relative difference of depths beyond which it is not, at least
 JUMP = 0.05  # relative step of depth to the surface in front, beyond which a pixel belongs to the one behind
 THICKNESS = 0.03  # share of the depth within which a Gaussian belongs to the recorded surface
 SCALE = 0.7  # of a pixel's Gaussian: its neighbours are drawn as well
+ENLARGED_SCALE = 1.0  # where pictures are drawn larger than they were fitted, and gaps would open between them
 ERROR_AROUND = 0.04  # the same over several pixels of the moving set, all of which it then condemns
 _SMOOTH_PX, _AROUND_PX = 1.0, 8.0
 
 
-def unexplained(scene: DynamicScene, view: View, priors: Priors, backend: str = "auto") -> Overlay:
+def unexplained(
+    scene: DynamicScene, view: View, priors: Priors, backend: str = "auto", *, enlarged: bool = False
+) -> Overlay:
     """The patches of all frames that make the recorded camera see what it recorded (docs/fit.md, "Overlay").
 
     A pixel is unexplained where the drawn picture has another colour or depth than the recorded one. There the frame's
     own pixels are put at their recorded depth, for this frame alone, and Gaussians of the scene in front of that
-    surface or on it are not drawn. What lies behind it stays, and is seen past its edges from other cameras.
+    surface or on it are not drawn. What lies behind it stays, and is seen past its edges from other cameras. Depth only
+    contradicts the scene beyond what its provider may err by, and not at all where it is assumed.
 
     Args:
         scene: fitted, without an overlay.
         view: the video, at the size at which it was fitted.
         priors: its depth.
         backend: of the rasterizer.
+        enlarged: whether the scene will be drawn at a larger size than the view's.
     """
-    patches, still = [], None
+    scale = ENLARGED_SCALE if enlarged else SCALE
+    patches, still, tolerance = [], None, depth_tolerance(priors)
     for frame in range(len(view.rgb)):
         camera, when = view.camera.select([frame]), torch.tensor([frame])
         depth = fill_depth(priors.depth[frame])
         if still is None or not view.camera.is_static:
             still = draw(_static_only(scene), camera, when, backend).depth[0]
         drawn = draw(scene, camera, when, backend)
-        wrong = _wrong(drawn, view.rgb[frame].float() / 255, depth)
+        wrong = _wrong(drawn, view.rgb[frame].float() / 255, depth, tolerance)
         taken = wrong & ~_behind_an_edge(depth.numpy(), still.numpy())
-        patches.append(_patch(scene, view, depth, frame, wrong, taken, backend))
+        patches.append(_patch(scene, view, depth, frame, wrong, taken, scale, backend))
     overlay = packed(patches)
     share = len(overlay.means) / max(priors.depth.numel(), 1)
     logger.info("overlay: %.1f %% of the recorded pixels are not explained and shown as recorded", 100 * share)
     return overlay
+
+
+def depth_tolerance(priors: Priors) -> float:
+    """Relative difference of depths beyond which a picture is wrong; infinite for depth that is only assumed."""
+    if priors.provenance.get("depth", {}).get("provider") == "plane":
+        return math.inf
+    return max(DEPTH_ERROR, priors.depth_error)
 
 
 def _static_only(scene: DynamicScene) -> DynamicScene:
@@ -64,13 +77,15 @@ def _static_only(scene: DynamicScene) -> DynamicScene:
     return DynamicScene(scene.static, nothing, (), (), (), scene.frames)
 
 
-def _wrong(drawn: Rendering, recorded: Float[Tensor, "h w 3"], depth: Float[Tensor, "h w"]) -> Bool[ndarray, "h w"]:
+def _wrong(
+    drawn: Rendering, recorded: Float[Tensor, "h w 3"], depth: Float[Tensor, "h w"], tolerance: float
+) -> Bool[ndarray, "h w"]:
     """Where a drawn picture has another colour or depth (m) than the recorded one, and the pixels beside."""
     difference = (drawn.rgb[0].clamp(0, 1) - recorded).abs().mean(-1).numpy()
     apart = (drawn.depth[0] / depth - 1).abs().numpy()
     moving = (drawn.moving[0] > 0.5).numpy()
     around = _blurred(difference * moving, _AROUND_PX) > ERROR_AROUND * _blurred(moving, _AROUND_PX)
-    wrong = (_blurred(difference, _SMOOTH_PX) > COLOUR_ERROR) | (apart > DEPTH_ERROR) | (moving & around)
+    wrong = (_blurred(difference, _SMOOTH_PX) > COLOUR_ERROR) | (apart > tolerance) | (moving & around)
     opened = cv2.morphologyEx(wrong.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
     return cv2.dilate(opened, np.ones((3, 3), np.uint8)) > 0
 
@@ -94,6 +109,7 @@ def _patch(
     frame: int,
     wrong: Bool[ndarray, "h w"],
     taken: Bool[ndarray, "h w"],
+    scale: float,
     backend: str,
 ) -> FramePatch:
     """The pixels that are taken as Gaussians, with colours that make the drawn picture the recorded one."""
@@ -101,7 +117,7 @@ def _patch(
     chosen = torch.from_numpy(taken).reshape(-1)
     pixels = pixel_gaussians(view.rgb[frame], depth, view.camera, frame)[0].select(chosen)
     hidden = _hidden(scene, camera, when, depth, torch.from_numpy(wrong), torch.from_numpy(taken))
-    log_scales, recorded = pixels.log_scales + math.log(SCALE), view.rgb[frame].reshape(-1, 3)[chosen].float() / 255
+    log_scales, recorded = pixels.log_scales + math.log(scale), view.rgb[frame].reshape(-1, 3)[chosen].float() / 255
     first = FramePatch(pixels.means, pixels.quats, log_scales, recorded, hidden)
     if len(first) == 0:
         return first

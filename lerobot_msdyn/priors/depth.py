@@ -2,6 +2,7 @@
 
 import math
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -31,8 +32,18 @@ def table_plane_depth(
     for instance in range(1, int(instances.max()) + 1):
         mask = instances == instance
         if bool(mask.any()):
-            depth = torch.where(mask, _standing(mask, rows)[:, None, None], depth)
+            whole = mask | (without_holes(mask) & (instances == 0))  # masks miss spots that look like the table
+            depth = torch.where(whole, _standing(mask, rows)[:, None, None], depth)
     return depth
+
+
+def without_holes(mask: Bool[Tensor, "t h w"]) -> Bool[Tensor, "t h w"]:
+    """Masks with what they enclose."""
+    whole = mask.to(torch.uint8).numpy().copy()
+    for frame in whole:
+        outlines, _ = cv2.findContours(frame, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(frame, outlines, -1, 1, cv2.FILLED)
+    return torch.from_numpy(whole).bool()
 
 
 def _standing(mask: Bool[Tensor, "t h w"], rows: Float[Tensor, " h"]) -> Float[Tensor, " t"]:

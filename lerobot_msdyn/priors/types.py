@@ -8,6 +8,10 @@ from torch import Tensor
 from lerobot_msdyn.cameras import CameraTrack
 from lerobot_msdyn.priors.hub import LocalModel
 
+# Relative error of depth that cannot be seen in the video, by the provider of depth; others: OTHER_DEPTH_ERROR.
+DEPTH_ERROR = {"recorded": 0.01, "stereo": 0.02, "plane": 0.10}
+OTHER_DEPTH_ERROR = 0.05
+
 
 @dataclass(frozen=True)
 class Origin:
@@ -58,3 +62,8 @@ class Priors:
     metric: bool  # whether depth is in true metres (a sensor or a calibration) or only plausible
     provenance: dict[str, dict[str, str]] = field(default_factory=dict)  # prior -> provider, why, model, licence
     camera: CameraTrack | None = None  # the one to use from here on; None: that of the video
+
+    @property
+    def depth_error(self) -> float:
+        """Relative error of depth that its provider is known to make."""
+        return DEPTH_ERROR.get(self.provenance.get("depth", {}).get("provider", ""), OTHER_DEPTH_ERROR)

@@ -24,9 +24,6 @@ WITNESSES = 3  # frames that are looked at where none was held out
 STILL_PX = 5  # side of the square around a pixel in which nothing may move for it to stand still
 TRACKED = 400  # points, at most, of which the residual is measured
 SSIM_WINDOW = 11
-# Relative error of depth that cannot be seen in the video, by the provider of depth; others: OTHER_DEPTH_ERROR.
-DEPTH_ERROR = {"recorded": 0.01, "stereo": 0.02, "plane": 0.10}
-OTHER_DEPTH_ERROR = 0.05
 
 
 @dataclass(frozen=True)
@@ -69,7 +66,6 @@ def witness(scene: DynamicScene, view: View, priors: Priors, held_out: Int[Tenso
     pictures = drawn.rgb.clamp(0, 1)
     following = (frames + 1).clamp(max=total - 1)
     still = stands_still(priors.instances[frames] > 0) & stands_still(priors.instances[following] > 0)
-    provider = priors.provenance.get("depth", {}).get("provider", "")
     return Witness(
         frames,
         len(held_out) > 0,
@@ -81,7 +77,7 @@ def witness(scene: DynamicScene, view: View, priors: Priors, held_out: Int[Tenso
         similarity(pictures, recorded),
         _track_residual(scene, view.camera, priors),
         flicker(recorded, view.rgb[following].float() / 255, still),
-        DEPTH_ERROR.get(provider, OTHER_DEPTH_ERROR),
+        priors.depth_error,
     )
 
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from lerobot_msdyn.priors.depth import table_plane_depth
+from lerobot_msdyn.priors.depth import table_plane_depth, without_holes
 
 K = torch.tensor([[50.0, 0.0, 32.0], [0.0, 50.0, 24.0], [0.0, 0.0, 1.0]])
 
@@ -30,3 +30,15 @@ def test_a_moving_thing_stands_on_the_table() -> None:
     assert depth[0, 12, 25].item() == pytest.approx(foot, rel=0.02)
     assert depth[0, 39, 25] == depth[0, 12, 25]
     torch.testing.assert_close(depth[7], empty[7])
+
+
+def test_spots_that_a_mask_misses_are_as_far_as_what_is_around_them() -> None:
+    mask = torch.zeros(2, 20, 20, dtype=torch.bool)
+    mask[0, 4:16, 4:16] = True
+    mask[1, 4:16, 4:16] = True
+    mask[1, 8:10, 8:10] = False
+    mask[1, 12:16, 10:12] = False  # open below
+    whole = without_holes(mask)
+    assert torch.equal(whole[0], mask[0])
+    assert whole[1, 8:10, 8:10].all()
+    assert not whole[1, 12:16, 10:12].any()
