@@ -1,10 +1,12 @@
 """Run the command on datasets that are broken in random ways, and see that it always ends well.
 
-python benchmarks/fuzz.py [--count 2000] [--seed 0] [--out FOLDER]
+python benchmarks/fuzz.py [--count 2000] [--seed 0] [--numbers 17 94]
 
-Every run must end by itself within a minute with exit code 0, 1 or 2, show no traceback, leave the source and
+Every run must end by itself within two minutes with exit code 0, 1 or 2, show no traceback, leave the source and
 everything beside the output as they were, and leave an output that LeRobot opens, or none. Rendering is replaced by
-turning the recorded pictures upside down, but for every 50th run: what is tried is reading and writing.
+turning the recorded pictures upside down, but for every 50th run: what is tried is reading and writing. Runs are made
+in processes of their own, 40 in each: one that crashes or hangs is counted, and the next process goes on after it.
+`--numbers` repeats single runs of the seed.
 """
 
 # ruff: noqa: E402 (the environment is set before LeRobot reads it)
@@ -12,9 +14,11 @@ turning the recorded pictures upside down, but for every 50th run: what is tried
 import argparse
 import collections
 import contextlib
+import faulthandler
 import io
 import json
 import logging
+import multiprocessing
 import os
 import random
 import shutil
@@ -23,10 +27,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 SCRATCH = Path(tempfile.mkdtemp(prefix="msdyn_fuzz_"))
 os.environ["HF_HOME"] = str(SCRATCH / "hf")
 os.environ["LEROBOT_MSDYN_CACHE"] = str(SCRATCH / "cache")
@@ -38,12 +45,14 @@ from lerobot.datasets import LeRobotDataset
 from lerobot_msdyn import augment, engines
 from lerobot_msdyn.cli import run_command
 from lerobot_msdyn.episode import read_episode
-from lerobot_msdyn.provenance import Provenance
+from lerobot_msdyn.provenance import Provenance, camera_pose
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.dataset import write_dataset
 from lerobot_msdyn.write import NewEpisode
 
-LIMIT_S = 60
+LIMIT_S = 120
+DEAD_S = LIMIT_S + 30  # a process that ignores the limit is killed
+BATCH = 40
 WHOLE_EVERY = 50
 FRAMES, WIDTH, HEIGHT = 4, 32, 24
 FLAGS = ["--cameras=[front]", "--variants=1", "--fit.steps=1", "--fit.max_width=16", "--scene.moving_gaussians=50"]
@@ -63,7 +72,10 @@ def fake_episode(source: Any, index: int, cameras: list[str], recipe: Any, outpu
     episode = read_episode(source, index, cameras, recipe.camera)
     views = {key: view.rgb.flip(1).numpy() for key, view in episode.views.items()}
     frames = [{key: rgb[t] for key, rgb in views.items()} for t in range(len(episode))]
-    new = output.stage(index, 0, iter(frames), Provenance(source.repo_id, index, 0, 0))
+    poses = {key: camera_pose(view.camera, view.camera) for key, view in episode.views.items()}
+    gate = {"views": {key: {"distance_m": 1.0} for key in views}, "rejected": []}
+    origin = Provenance(source.repo_id, index, 0, 0, {key: {"yaw_deg": 0.0} for key in views}, {}, poses, gate)
+    new = replace(output.stage(index, 0, iter(frames), origin), seconds={"judging": 0.0})
     return [NewEpisode(index, Provenance(source.repo_id, index, -1, 0)), new]
 
 
@@ -195,38 +207,53 @@ def listing(root: Path) -> dict[str, tuple[Any, ...]]:
     }
 
 
-def trial(original: Path, place: Path, rng: random.Random, *, whole: bool) -> tuple[str, int | None, list[str], str]:
-    """One broken dataset; what was broken, the exit code, what went wrong, and what was said."""
+def break_copy(original: Path, place: Path, rng: random.Random) -> str:
+    """A broken copy in `place`/ds; returns what was broken."""
     shutil.rmtree(place, ignore_errors=True)
-    source, out = place / "ds", place / "out"
-    shutil.copytree(original, source)
+    shutil.copytree(original, place / "ds")
     broken = []
     for _ in range(rng.choice([1, 1, 1, 2, 3])):
         with contextlib.suppress(OSError, ValueError, KeyError, IndexError, TypeError, pa.ArrowException):
-            broken.append(mutate(source, rng))  # the second may find the file unusable that the first broke
-    before, here = listing(source), set(listing(Path.cwd()))
+            broken.append(mutate(place / "ds", rng))  # the second may find the file unusable that the first broke
+    return "; ".join(broken)
+
+
+def command(place: Path, *, whole: bool) -> tuple[int | None, list[str], str]:
+    """Run the command on `place`/ds; the exit code, what went wrong, and what was said."""
     said, code, faults = io.StringIO(), None, []
     engines.augment_episode = REAL if whole else fake_episode
     logging.basicConfig(level=logging.INFO, stream=said, force=True)
+    begin = time.perf_counter()
     signal.alarm(LIMIT_S)
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            run_command(augment.run, ["--repo=local/ds", f"--root={source}", f"--new_root={out}", *FLAGS])
+            names = ["--repo=local/ds", f"--root={place / 'ds'}", f"--new_root={place / 'out'}"]
+            run_command(augment.run, [*names, *FLAGS])
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else None
     except BaseException as error:
         faults.append(f"{type(error).__name__} {error}")
     finally:
         signal.alarm(0)
-    text = said.getvalue()
+    if time.perf_counter() - begin > LIMIT_S:
+        faults.append(f"more than {LIMIT_S} s")
     if code not in (0, 1, 2):
         faults.append(f"exit code {code}")
+    text = said.getvalue()
     if "Traceback" in text or "please report" in text:
         faults.append("traceback")
-    if listing(source) != before:
-        faults.append("the source was touched")
     if code == 2 and text.count("error: ") != 1:
         faults.append("not one line")
+    return code, faults, text
+
+
+def trial(place: Path, *, whole: bool) -> tuple[int | None, list[str], str]:
+    """The command on the broken copy in `place`, and all that it must not have done."""
+    source, out = place / "ds", place / "out"
+    before, here = listing(source), set(listing(Path.cwd()))
+    code, faults, text = command(place, whole=whole)
+    if listing(source) != before:
+        faults.append("the source was touched")
     there = {path.name for path in place.iterdir()}
     if there - {"ds"} != ({"out"} if code in (0, 1) else set()):
         faults.append(f"left behind: {sorted(there)}")
@@ -238,7 +265,58 @@ def trial(original: Path, place: Path, rng: random.Random, *, whole: bool) -> tu
             assert len(dataset[i]) > 0 if (i := len(dataset) - 1) else True
         except Exception as error:
             faults.append(f"the output cannot be opened: {type(error).__name__} {error}")
-    return "; ".join(broken), code, faults, text
+    return code, faults, text
+
+
+def batch(numbers: list[int], seed: int, send: Connection) -> None:
+    """Some trials; for each, what was broken is sent before it, and what came of it after it."""
+    faulthandler.enable()
+    signal.signal(signal.SIGALRM, late)
+    for number in numbers:
+        rng = random.Random(seed * 1_000_003 + number)
+        send.send(break_copy(SCRATCH / ("image" if number % 4 == 3 else "video"), SCRATCH / "place", rng))
+        send.send(trial(SCRATCH / "place", whole=number % WHOLE_EVERY == 0))
+    shutil.rmtree(SCRATCH / "hf", ignore_errors=True)
+
+
+def late(*_: Any) -> None:
+    """The limit is over."""
+    raise TimeoutError(f"more than {LIMIT_S} s")
+
+
+def trials(numbers: list[int], seed: int) -> Iterator[tuple[int, str, int | None, list[str], str]]:
+    """Number, what was broken, exit code, faults and text of each trial, whatever it does to its process."""
+    while numbers:
+        receive, send = FORK.Pipe(duplex=False)
+        process = FORK.Process(target=batch, args=(numbers[:BATCH], seed, send))
+        process.start()
+        send.close()
+        for number in numbers[:BATCH]:
+            broken = "?"
+            try:
+                if not receive.poll(DEAD_S):
+                    raise TimeoutError
+                broken = receive.recv()
+                if not receive.poll(DEAD_S):
+                    raise TimeoutError
+                outcome = receive.recv()
+            except (TimeoutError, EOFError) as error:
+                process.kill() if isinstance(error, TimeoutError) else None
+                process.join()
+                outcome = (process.exitcode, ["hangs" if isinstance(error, TimeoutError) else "crashes"], "")
+            numbers = numbers[1:]
+            yield number, broken, *outcome
+            if process.exitcode is not None:
+                break
+        process.join()
+        receive.close()
+
+
+def write_originals() -> None:
+    """The datasets to break: pictures as videos, and as images."""
+    scenes = [make_scene("push", 0, FRAMES, WIDTH, HEIGHT, episode=index) for index in range(3)]
+    for name, dtype in (("video", "video"), ("image", "image")):
+        write_dataset(scenes, "local/ds", SCRATCH / name, cameras=["front", "side"], depth=True, image_dtype=dtype)
 
 
 def main() -> int:
@@ -246,38 +324,34 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--numbers", type=int, nargs="+")
     options = parser.parse_args()
-
-    def late(*_: Any) -> None:
-        raise TimeoutError(f"more than {LIMIT_S} s")
-
-    signal.signal(signal.SIGALRM, late)
     work = SCRATCH / "work"
     work.mkdir()
     os.chdir(work)
-    scenes = [make_scene("push", 0, FRAMES, WIDTH, HEIGHT, episode=index) for index in range(3)]
-    for name, dtype in (("video", "video"), ("image", "image")):
-        write_dataset(scenes, "local/ds", SCRATCH / name, cameras=["front", "side"], depth=True, image_dtype=dtype)
+    writer = FORK.Process(target=write_originals)  # this process must not have threads of its own when it is copied
+    writer.start()
+    writer.join()
+    numbers = options.numbers or list(range(options.count))
     codes: collections.Counter[int | None] = collections.Counter()
-    bad = 0
+    bad = []
     begin = time.perf_counter()
-    for number in range(options.count):
-        rng = random.Random(options.seed * 1_000_003 + number)
-        original = SCRATCH / ("image" if number % 4 == 3 else "video")
-        broken, code, faults, text = trial(original, SCRATCH / "place", rng, whole=number % WHOLE_EVERY == 0)
+    for done, (number, broken, code, faults, text) in enumerate(trials(numbers, options.seed), 1):
         codes[code] += 1
         if faults:
-            bad += 1
+            bad.append(number)
             print(f"{number}: {broken}: {'; '.join(faults)}\n{text[-1500:]}\n", flush=True)
-        if number % 100 == 99:
-            shutil.rmtree(SCRATCH / "hf", ignore_errors=True)
-            print(f"{number + 1}: {dict(codes)}, {bad} bad, {time.perf_counter() - begin:.0f} s", flush=True)
-    print(f"{options.count} broken datasets: exit codes {dict(codes)}; {bad} ended badly")
+        elif options.numbers:
+            print(f"{number}: {broken}: exit code {code}\n{text[-1500:]}\n", flush=True)
+        if done % 100 == 0:
+            print(f"{done}: {dict(codes)}, {len(bad)} bad, {time.perf_counter() - begin:.0f} s", flush=True)
+    print(f"{len(numbers)} broken datasets: exit codes {dict(codes)}; ended badly: {bad or 'none'}")
     os.chdir("/")
     shutil.rmtree(SCRATCH, ignore_errors=True)
-    return int(bad > 0)
+    return int(bool(bad))
 
 
+FORK = multiprocessing.get_context("fork")
 REAL = engines.augment_episode
 
 if __name__ == "__main__":

@@ -247,7 +247,11 @@ def _check_options(name: str, options: object) -> None:
 def _check_tasks(root: Path, total: int) -> None:
     table = _read_table(regular_file(root, "meta/tasks.parquet"), None)
     indices = table["task_index"].to_pylist() if "task_index" in table.column_names else []
-    if len(table.column_names) != 2 or sorted(map(str, indices)) != sorted(map(str, range(total))):
+    texts = [
+        column for column in table.columns if pa.types.is_string(column.type) or pa.types.is_large_string(column.type)
+    ]
+    complete = len(indices) == total and sorted(map(str, indices)) == sorted(map(str, range(total)))
+    if len(table.column_names) != 2 or len(texts) != 1 or not complete:
         raise DatasetError(
             f"{root / 'meta' / 'tasks.parquet'}: expected a text and a task_index from 0 to {total - 1} for each task, "
             "as many as info.json's total_tasks"
@@ -265,7 +269,7 @@ def _check_episodes(root: Path, info: dict[str, Any], video_keys: list[str]) -> 
     tables = [_read_table(regular_file(root, path.relative_to(root)), columns) for path in files]
     episodes = [value for table in tables for value in table["episode_index"].to_pylist()]
     lengths = [value for table in tables for value in table["length"].to_pylist()]
-    if episodes != list(range(info["total_episodes"])):
+    if len(episodes) != info["total_episodes"] or episodes != list(range(len(episodes))):
         raise DatasetError(
             f"{folder}: {len(episodes)} episodes, {_short(episodes)}; expected 0 to {info['total_episodes'] - 1}, as "
             "many as info.json's total_episodes"

@@ -10,11 +10,13 @@ from typing import Any
 import torch
 from jaxtyping import Int
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
+from safetensors.torch import save as save_tensors
 from torch import Tensor
 
 from lerobot_msdyn.cameras import CameraTrack
 from lerobot_msdyn.errors import MsdynError
+from lerobot_msdyn.files import write_whole, writing
 from lerobot_msdyn.scene import DynamicScene, load_scene, save_scene
 
 FOLDER = Path("msdyn_scenes")  # inside an output dataset
@@ -63,20 +65,17 @@ def camera_folder(root: Path, episode: int, camera: str) -> Path:
 
 
 def save(scene: SavedScene, root: Path) -> Path:
-    """Write a scene below a folder of scenes, replacing one that is there; returns its own folder."""
+    """Write a scene below a folder of scenes, replacing one that is there; returns its own folder.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
     folder = camera_folder(root, scene.source.episode, scene.source.camera)
     partial = folder.with_name(f".{folder.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    for number, window in enumerate(scene.windows):
-        save_scene(window, partial / _WINDOW.format(number))
-    save_file(
-        {
-            "intrinsics": scene.camera.intrinsics.contiguous(),
-            "world_from_camera": scene.camera.world_from_camera.contiguous(),
-        },
-        partial / _CAMERA,
-    )
+    camera = {
+        "intrinsics": scene.camera.intrinsics.contiguous(),
+        "world_from_camera": scene.camera.world_from_camera.contiguous(),
+    }
     header = {
         "schema": SCHEMA_VERSION,
         "source": asdict(scene.source),
@@ -89,9 +88,15 @@ def save(scene: SavedScene, root: Path) -> Path:
         "distance_m": scene.distance,
         "priors": scene.priors,
     }
-    (partial / _HEADER).write_text(json.dumps(header, indent=1), encoding="utf-8")
-    shutil.rmtree(folder, ignore_errors=True)
-    partial.rename(folder)
+    with writing(folder):
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        for number, window in enumerate(scene.windows):
+            save_scene(window, partial / _WINDOW.format(number))
+        write_whole(partial / _CAMERA, save_tensors(camera))
+        (partial / _HEADER).write_text(json.dumps(header, indent=1), encoding="utf-8")
+        shutil.rmtree(folder, ignore_errors=True)
+        partial.rename(folder)
     return folder
 
 

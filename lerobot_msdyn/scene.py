@@ -7,10 +7,11 @@ from pathlib import Path
 import torch
 from jaxtyping import Float, Int
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
 from lerobot_msdyn.errors import MsdynError
+from lerobot_msdyn.files import write_whole
 from lerobot_msdyn.geometry import quaternion_multiply, quaternion_to_matrix
 from lerobot_msdyn.motion.bases import MotionLevel
 from lerobot_msdyn.motion.compose import Level, compose
@@ -203,13 +204,8 @@ def save_scene(scene: DynamicScene, path: Path) -> None:
         "frames": scene.frames,
         "near": scene.near,
     }
-    partial = path.with_name(path.name + ".partial")
-    save_file(
-        {name: tensor.detach().cpu().contiguous() for name, tensor in scene.tensors().items()},
-        partial,
-        metadata={"lerobot_msdyn": json.dumps(header)},
-    )
-    partial.replace(path)
+    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in scene.tensors().items()}
+    write_whole(path, save(tensors, metadata={"lerobot_msdyn": json.dumps(header)}))
 
 
 def load_scene(path: Path) -> DynamicScene:

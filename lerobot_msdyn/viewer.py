@@ -104,7 +104,7 @@ def _reconstructed(config: ViewerConfig, source: Any, index: int, key: str, view
 class _Log:
     """Entities of one camera, by frame."""
 
-    def __init__(self, stream: "rr.RecordingStream", root: str, fps: float) -> None:
+    def __init__(self, stream: "rr.RecordingStream", root: str, fps: int | float) -> None:
         self.stream, self.root, self.fps = stream, root, fps
 
     def at(self, frame: int, path: str, what: Any) -> None:

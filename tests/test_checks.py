@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -49,7 +50,9 @@ def test_real_metadata_is_fine(desk: Path, image_desk: Path) -> None:
         (["fps"], float("nan"), "fps is nan"),
         (["total_frames"], 10**12, "lengths are .* add up to .* 1000000000000"),
         (["total_episodes"], 2, "3 episodes, .*; expected 0 to 1"),
+        (["total_episodes"], 10**9, "3 episodes, .*; expected 0 to 999999999"),
         (["total_tasks"], 7, r"tasks.parquet: expected .* from 0 to 6"),
+        (["total_tasks"], 10**12, r"tasks.parquet: expected .* from 0 to 999999999999"),
         (["data_path"], "../../../etc/{chunk_index}-{file_index}", "leaves the dataset's folder"),
         (["data_path"], "/etc/passwd", "leaves the dataset's folder"),
         (["data_path"], "{chunk_index.__class__.__mro__}", "is not one of chunk_index, file_index"),
@@ -91,6 +94,15 @@ def test_files_that_are_not_what_their_names_say(root: Path) -> None:
             open_source("local/ds", root)
         path.write_bytes(good)
     check_metadata(root)
+
+
+def test_tasks_that_are_no_text(root: Path) -> None:
+    path = root / "meta" / "tasks.parquet"
+    table = pq.read_table(path)
+    for bad in ([float("nan")] * len(table), [3] * len(table)):
+        pq.write_table(table.set_column(table.column_names.index("task"), "task", pa.array(bad)), path)
+        with pytest.raises(DatasetError, match=r"expected a text and a task_index"):
+            check_metadata(root)
 
 
 def test_an_episode_table_that_lacks_a_column(root: Path) -> None:

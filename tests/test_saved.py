@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from lerobot_msdyn import saved
-from lerobot_msdyn.errors import MsdynError
+from lerobot_msdyn.errors import MsdynError, OutputError
 from lerobot_msdyn.saved import SavedScene
 
 FRONT = "observation.images.front"
@@ -45,6 +45,12 @@ def test_what_is_saved_comes_back(scene: SavedScene, tmp_path: Path) -> None:
         assert all(torch.equal(tensor, other.tensors()[name]) for name, tensor in window.tensors().items())
     assert again.size_in_bytes == scene.size_in_bytes > 10_000
     assert [path.name for path in (tmp_path / "episode_000001").iterdir()] == [FRONT]
+
+
+def test_a_place_that_cannot_be_written_is_the_disks_fault(scene: SavedScene, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(OutputError, match="cannot be written"):
+        saved.save(scene, tmp_path / "file")
 
 
 def test_what_cannot_be_read_is_named(scene: SavedScene, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from lerobot_msdyn.cli import parse_config
 from lerobot_msdyn.config import AugmentConfig, PerturbationConfig, Recipe
 from lerobot_msdyn.errors import DatasetError
 from lerobot_msdyn.saved import SavedScene
-from lerobot_msdyn.training.cache import Scenes
+from lerobot_msdyn.training.scene_cache import Scenes
 
 logger = logging.getLogger(__name__)
 

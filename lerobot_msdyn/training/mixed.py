@@ -10,8 +10,8 @@ import torch
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_msdyn.config import MixedViewsConfig, PerturbationConfig
-from lerobot_msdyn.training.cache import Scenes
 from lerobot_msdyn.training.mixer import ViewMixer, colour_sample, depth_sample
+from lerobot_msdyn.training.scene_cache import Scenes
 
 
 class MixedViews(torch.utils.data.Dataset):

@@ -16,8 +16,8 @@ from lerobot_msdyn.episode import MILLIMETRES, depth_key_of
 from lerobot_msdyn.errors import ConfigError
 from lerobot_msdyn.perturbation import Viewpoint, amounts_of, draw, moved
 from lerobot_msdyn.saved import SavedScene
-from lerobot_msdyn.training.cache import SceneCache, Scenes
 from lerobot_msdyn.training.matching import perturbation_of, scenes_of
+from lerobot_msdyn.training.scene_cache import SceneCache, Scenes
 
 
 class ViewMixer:

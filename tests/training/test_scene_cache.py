@@ -4,7 +4,7 @@ import pickle
 from pathlib import Path
 
 from lerobot_msdyn import saved
-from lerobot_msdyn.training.cache import MEGABYTE, SceneCache
+from lerobot_msdyn.training.scene_cache import MEGABYTE, SceneCache
 
 FRONT = "observation.images.front"
 
