@@ -79,6 +79,11 @@ def _reconstruct(
     k = camera.intrinsics[0]
     parameters = ",".join(str(float(value)) for value in (k[0, 0], k[1, 1], k[0, 2], k[1, 2]))
     database = folder / "database.db"
+    # One thread and fixed seeds, so that the same video gives the same poses every time.
+    extraction = pycolmap.FeatureExtractionOptions(num_threads=1)
+    matching, verification = pycolmap.FeatureMatchingOptions(num_threads=1), pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed, verification.ransac.num_threads = 0, 1
+    mapping = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=0)
     pycolmap.extract_features(
         database,
         folder / "images",
@@ -86,9 +91,15 @@ def _reconstruct(
         reader_options=pycolmap.ImageReaderOptions(
             camera_model="PINHOLE", camera_params=parameters, mask_path=folder / "masks"
         ),
+        extraction_options=extraction,
     )
-    pycolmap.match_sequential(database, pairing_options=pycolmap.SequentialPairingOptions(overlap=_OVERLAP))
-    models: dict[int, Any] = pycolmap.incremental_mapping(database, folder / "images", folder)
+    pycolmap.match_sequential(
+        database,
+        matching_options=matching,
+        pairing_options=pycolmap.SequentialPairingOptions(overlap=_OVERLAP),
+        verification_options=verification,
+    )
+    models: dict[int, Any] = pycolmap.incremental_mapping(database, folder / "images", folder, mapping)
     if not models:
         return None
     model = max(models.values(), key=lambda item: item.num_reg_images())
