@@ -136,6 +136,12 @@ class DynamicScene:
     near: float = 0.01  # m; nothing that is as near to a camera is drawn
     overlay: Overlay | None = None  # none: nothing is shown as it was recorded
 
+    def still(self) -> "DynamicScene":
+        """The same without what moves and without an overlay: the static set, its brightness and the near plane."""
+        shading = None if self.shading is None else replace(self.shading, moving=self.shading.moving[:, :0])
+        nothing = self.moving.select(slice(0))
+        return replace(self, moving=nothing, levels=(), indices=(), logits=(), shading=shading, overlay=None)
+
     def at(self, frames: Int[Tensor, " b"], eye: Float[Tensor, "b 3"] | None = None) -> Snapshot:
         """The scene at some frames, differentiable in all Gaussians and bases.
 

@@ -54,7 +54,7 @@ def unexplained(
         camera, when = view.camera.select([frame]), torch.tensor([frame])
         depth = fill_depth(priors.depth[frame])
         if still is None or not view.camera.is_static:
-            still = draw(_static_only(scene), camera, when, backend).depth[0]
+            still = draw(scene.still(), camera, when, backend).depth[0]
         drawn = draw(scene, camera, when, backend)
         wrong = _wrong(drawn, view.rgb[frame].float() / 255, depth, tolerance)
         taken = wrong & ~_behind_an_edge(depth.numpy(), still.numpy())
@@ -70,11 +70,6 @@ def depth_tolerance(priors: Priors) -> float:
     if priors.provenance.get("depth", {}).get("provider") == "plane":
         return math.inf
     return max(DEPTH_ERROR, priors.depth_error)
-
-
-def _static_only(scene: DynamicScene) -> DynamicScene:
-    nothing = scene.moving.select(torch.zeros(0, dtype=torch.long))
-    return DynamicScene(scene.static, nothing, (), (), (), scene.frames)
 
 
 def _wrong(

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -129,11 +129,8 @@ def _filled(rendering: Rendering, i: int, fill: Fill) -> Float[Tensor, "h w 3"]:
 
 def _still_filled(scene: DynamicScene, camera: CameraTrack, times: Tensor, fill: Fill) -> Float[Tensor, "1 h w 3"]:
     """What stands still through a fixed camera, filled once for all frames, so that nothing flickers."""
-    shading = None if scene.shading is None else replace(scene.shading, moving=scene.shading.moving[:, :0])
-    nothing = scene.moving.select(slice(0))
-    still = replace(scene, moving=nothing, levels=(), indices=(), logits=(), shading=shading, overlay=None)
     middle = [len(times) // 2]
-    rendering = next(render_frames(still, camera.select(middle), times[middle]))
+    rendering = next(render_frames(scene.still(), camera.select(middle), times[middle]))
     return _filled(rendering, 0, fill)[None]
 
 

@@ -2,7 +2,6 @@
 
 import copy
 import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -47,13 +46,12 @@ class MixedViews(torch.utils.data.Dataset):
             MsdynError: there are no scenes, or they are of other videos.
         """
         self.dataset = dataset
-        folder = scenes if not isinstance(scenes, str | os.PathLike) else Path(scenes)
         deltas = {
             key: [round(delta * dataset.fps) for delta in window]
             for key, window in (dataset.delta_timestamps or {}).items()
         }
         self.mixer = ViewMixer(
-            dataset.meta, dataset.episodes, deltas, folder, probability, perturbation, seed, memory_mb
+            dataset.meta, dataset.episodes, deltas, scenes, probability, perturbation, seed, memory_mb
         )
         self._starts = np.asarray(dataset.meta.episodes["dataset_from_index"], np.int64)
         chosen = dataset.absolute_to_relative_idx

@@ -1,5 +1,6 @@
 """Decides which samples are seen from elsewhere, and draws them: a function of (seed, epoch, index) alone."""
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -28,7 +29,7 @@ class ViewMixer:
         meta: LeRobotDatasetMetadata,
         episodes: list[int] | None,
         deltas: dict[str, list[int]],
-        scenes: Path | Scenes,
+        scenes: str | os.PathLike[str] | Scenes,
         probability: float,
         perturbation: PerturbationConfig | None,
         seed: int,
@@ -43,6 +44,8 @@ class ViewMixer:
         found = problems(MixedViewsConfig(probability=probability, seed=seed, memory_mb=memory_mb))
         if found:
             raise ConfigError("; ".join(found))
+        if isinstance(scenes, str | os.PathLike):
+            scenes = Path(scenes)
         self.probability, self.seed, self.deltas = probability, seed, deltas
         self.perturbation = perturbation_of(scenes) if perturbation is None else perturbation
         if isinstance(self.perturbation, OtherCameraConfig):

@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -31,12 +30,11 @@ class MixedStream(torch.utils.data.IterableDataset):
     ) -> None:
         """Arguments and errors as in `MixedViews`, but `dataset` is a StreamingLeRobotDataset."""
         self.dataset = dataset
-        folder = scenes if not isinstance(scenes, str | os.PathLike) else Path(scenes)
         self.mixer = ViewMixer(
             dataset.meta,
             dataset.episodes,
             dict(dataset.delta_indices or {}),
-            folder,
+            scenes,
             probability,
             perturbation,
             seed,
