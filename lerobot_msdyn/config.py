@@ -13,6 +13,7 @@ import draccus
 # Named: draccus finds the comment above a field only where its annotation holds no quotes.
 Device = Literal["auto", "cpu", "cuda"]
 Fill = Literal["inpaint", "nearest", "none"]
+Protocol = Literal["som", "dycheck"]
 LevelName = Literal["object", "primitive", "grain", "particle", "flat", "field"]
 
 
@@ -410,10 +411,40 @@ class EvaluateConfig(Recipe):
 
     # Folder with dataset/ (or dataset_depth/) and gt/, see docs/evaluate.md.
     scene_folder: Path = Path()
-    # Where the rendered views go: OUT/<camera>/rgb_%04d.png.
+    # Where the rendered views go: OUT/<camera>/rgb_%04d.png; and OUT/scores.json.
     out: Path = Path()
     # recorded, none, or an .npz file with depth [t,h,w].
     depth: str = "recorded"
+
+
+@dataclass
+class DycheckConfig(Recipe):
+    """`python -m lerobot_msdyn.evaluate dycheck`: fit a DyCheck iPhone sequence, score its validation views."""
+
+    # Folder of the sequence, with rgb/, splits/ and so on, see docs/evaluate.md.
+    root: Path = Path()
+    # Where the rendered views go: OUT/rgb/<id>.png; and OUT/scores.json.
+    out: Path = Path()
+    # som (1x pictures, Shape of Motion's processed package) or dycheck (2x pictures, cameras of the sequence).
+    protocol: Protocol = "som"
+
+
+@dataclass
+class HeldoutCameraConfig(Recipe):
+    """`python -m lerobot_msdyn.evaluate heldout-camera`: fit one camera of a rig, score what another one saw."""
+
+    # Source dataset (alias: --repo).
+    repo_id: str = ""
+    # Exact folder of the source dataset; default: LeRobot's home, then the hub.
+    root: Path | None = None
+    # The episode.
+    episode: int = 0
+    # The camera that is fitted, by feature key or its last part.
+    train_camera: str = ""
+    # The camera that is compared with; it is not fitted.
+    test_camera: str = ""
+    # Where the rendered views go: OUT/rgb_%04d.png; and OUT/scores.json.
+    out: Path = Path()
 
 
 @dataclass
@@ -528,6 +559,8 @@ _RANGES: dict[str, tuple[tuple[str, float, float], ...]] = {
     "Recipe": _RECIPE_RANGES,
     "AugmentConfig": _RECIPE_RANGES,
     "EvaluateConfig": _RECIPE_RANGES,
+    "DycheckConfig": _RECIPE_RANGES,
+    "HeldoutCameraConfig": (*_RECIPE_RANGES, ("episode", 0, 1_000_000_000)),
     "ViewerConfig": _RECIPE_RANGES,
     "PriorsCommandConfig": (*_RECIPE_RANGES, ("columns", 1, 100)),
     "CameraConfig": (("horizontal_fov_deg", 5, 170), ("height_m", 0.01, 100), ("tilt_deg", 1, 90)),

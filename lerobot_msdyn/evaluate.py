@@ -1,104 +1,93 @@
-"""Command line: measure a reconstruction on views that it has not seen.
+"""Command line: measure a reconstruction on views that it has not seen (docs/evaluate.md).
 
-    python -m lerobot_msdyn.evaluate nvs --scene FOLDER --out DIR
-
-FOLDER holds `dataset/` (a LeRobot dataset with one episode), `dataset_depth/` (the same with recorded depth),
-`gt/train.npz` (K and c2w of the recorded camera) and `gt/heldout/<camera>.npz` (frame, c2w, K); see docs/evaluate.md.
-Nothing else of `gt/` is read.
+python -m lerobot_msdyn.evaluate nvs --scene FOLDER --out DIR
+python -m lerobot_msdyn.evaluate dycheck --root SEQUENCE --out DIR
+python -m lerobot_msdyn.evaluate heldout-camera --repo ID --train-camera A --test-camera B --calibration FILE --out DIR
 """
 
-import logging
 import sys
-import time
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from lerobot_msdyn.cli import EXIT_OK, parse_config, run_command
-from lerobot_msdyn.config import EvaluateConfig
-from lerobot_msdyn.errors import ConfigError, DatasetError
+from lerobot_msdyn.config import DycheckConfig, EvaluateConfig, HeldoutCameraConfig
+from lerobot_msdyn.errors import ConfigError
 
-logger = logging.getLogger(__name__)
+COMMAND = "python -m lerobot_msdyn.evaluate"
 
-COMMAND = "python -m lerobot_msdyn.evaluate nvs"
-ALIASES = {"scene": "scene_folder"}
+
+def _nvs(config: EvaluateConfig) -> str:
+    from lerobot_msdyn.evaluation.nvs import evaluate_nvs
+
+    return evaluate_nvs(config).text()
+
+
+def _dycheck(config: DycheckConfig) -> str:
+    from lerobot_msdyn.evaluation.dycheck import evaluate_dycheck
+
+    return evaluate_dycheck(config).text()
+
+
+def _heldout_camera(config: HeldoutCameraConfig) -> str:
+    from lerobot_msdyn.evaluation.heldout import evaluate_heldout
+
+    return evaluate_heldout(config).text()
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """One kind of evaluation."""
+
+    config: type
+    run: Callable[[Any], str]  # config -> what is printed
+    needed: dict[str, str]  # flag -> field that must be given
+    usage: str
+
+
+EVALUATIONS = {
+    "nvs": Evaluation(EvaluateConfig, _nvs, {"scene": "scene_folder", "out": "out"}, "--scene FOLDER --out DIR"),
+    "dycheck": Evaluation(DycheckConfig, _dycheck, {"root": "root", "out": "out"}, "--root SEQUENCE --out DIR"),
+    "heldout-camera": Evaluation(
+        HeldoutCameraConfig,
+        _heldout_camera,
+        {
+            "repo": "repo_id",
+            "train-camera": "train_camera",
+            "test-camera": "test_camera",
+            "calibration": "camera.calibration",
+            "out": "out",
+        },
+        "--repo ID --train-camera A --test-camera B --calibration FILE --out DIR",
+    ),
+}
 
 
 def run(arguments: list[str]) -> int:
     """Run an evaluation; returns the exit code."""
-    if not arguments or arguments[0] not in ("nvs", "-h", "--help"):
-        given = arguments[0] if arguments else "nothing"
-        raise ConfigError(f"which evaluation? got {given!r}; expected: {COMMAND} --scene FOLDER --out DIR")
-    config = parse_config(EvaluateConfig, arguments[arguments[0] == "nvs" :], ALIASES, command=COMMAND)
-    for name, path in (("scene", config.scene_folder), ("out", config.out)):
-        if path == Path():
-            raise ConfigError(f"--{name} is missing; expected: {COMMAND} --scene FOLDER --out DIR")
-    evaluate_nvs(config)
+    name = arguments[0] if arguments else "nothing"
+    if name in ("-h", "--help"):
+        sys.stdout.write(
+            "usage:\n" + "".join(f"  {COMMAND} {each} {kind.usage}\n" for each, kind in EVALUATIONS.items())
+        )
+        return EXIT_OK
+    kind = EVALUATIONS.get(name)
+    if kind is None:
+        raise ConfigError(f"which evaluation? got {name!r}; expected: {COMMAND} {' | '.join(EVALUATIONS)} (--help)")
+    command = f"{COMMAND} {name}"
+    config = parse_config(kind.config, arguments[1:], kind.needed, command=command)
+    empty = kind.config()
+    for flag, path in kind.needed.items():
+        if _value(config, path) == _value(empty, path):
+            raise ConfigError(f"--{flag} is missing; expected: {command} {kind.usage}")
+    sys.stdout.write(kind.run(config))
     return EXIT_OK
 
 
-def evaluate_nvs(config: EvaluateConfig) -> dict[str, float]:
-    """Fit the episode, render its held-out cameras to `out`, and return the seconds of each stage."""
-    import cv2
-    import torch
-
-    from lerobot_msdyn.cameras import CameraTrack
-    from lerobot_msdyn.episode import open_source, read_episode, select_cameras
-    from lerobot_msdyn.pipeline import reconstruct
-    from lerobot_msdyn.views import new_pictures
-
-    seconds: dict[str, float] = {}
-    start = time.perf_counter()
-    folder = config.scene_folder
-    recorded = config.depth == "recorded"
-    train = _arrays(folder / "gt" / "train.npz", ("K", "c2w"))
-    source = open_source(f"local/{folder.name}", folder / ("dataset_depth" if recorded else "dataset"))
-    key = select_cameras(source, config.cameras)[0]
-    episode = read_episode(source, 0, [key], config.camera, recorded_depth=recorded)
-    view = episode.views[key]
-    height, width = view.rgb.shape[1:3]
-
-    def track(intrinsics: Any, poses: Any) -> CameraTrack:
-        k = torch.as_tensor(intrinsics).float().expand(len(poses), 3, 3).contiguous()
-        return CameraTrack(k, torch.as_tensor(poses).float(), width, height)
-
-    view = replace(view, camera=track(train["K"], train["c2w"]))
-    seconds["read"] = time.perf_counter() - start
-    config.priors.depth = {"recorded": "recorded", "none": "plane"}.get(config.depth, config.depth)
-    start = time.perf_counter()
-    scene = reconstruct(view, config)
-    seconds["priors and initialisation"] = time.perf_counter() - start - scene.seconds
-    seconds["fit"] = scene.seconds
-    start = time.perf_counter()
-    pictures = 0
-    for path in sorted((folder / "gt" / "heldout").glob("*.npz")):
-        heldout = _arrays(path, ("frame", "c2w", "K"))
-        out = config.out / path.stem
-        out.mkdir(parents=True, exist_ok=True)
-        frames = torch.as_tensor(heldout["frame"]).long()
-        for frame, picture in zip(
-            frames.tolist(), new_pictures(scene, track(heldout["K"], heldout["c2w"]), frames), strict=True
-        ):
-            cv2.imwrite(str(out / f"rgb_{frame:04d}.png"), picture.rgb[..., ::-1])
-            pictures += 1
-    seconds["render"] = time.perf_counter() - start
-    for stage, value in seconds.items():
-        sys.stdout.write(f"{stage:28s}{value:8.1f} s\n")
-    sys.stdout.write(f"{pictures} pictures written to {config.out}\n")
-    return seconds
-
-
-def _arrays(path: Path, names: tuple[str, ...]) -> dict[str, Any]:
-    """Some arrays of an npz file; the others are not read."""
-    import numpy as np
-
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in names}
-    except (OSError, ValueError, KeyError) as error:
-        raise DatasetError(
-            f"{path}: expected an npz file with {', '.join(names)} ({error}); see docs/evaluate.md"
-        ) from error
+def _value(config: object, path: str) -> object:
+    for name in path.split("."):
+        config = getattr(config, name)
+    return config
 
 
 def main() -> None:

@@ -35,7 +35,7 @@ ONLY_IN = {
         "engines",
         "report",
         "augment",
-        "evaluate",
+        "evaluation",
         "training",
     },
 }

@@ -8,6 +8,7 @@ from pathlib import Path
 from lerobot_msdyn.errors import MsdynError
 from lerobot_msdyn.synthetic.choreography import KINDS
 from lerobot_msdyn.synthetic.dataset import write_dataset
+from lerobot_msdyn.synthetic.iphone import write_iphone_folder
 from lerobot_msdyn.synthetic.nvs import write_nvs_folder
 from lerobot_msdyn.synthetic.scene import make_scene
 
@@ -23,9 +24,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--out", type=Path, required=True, help="folder to create")
     parser.add_argument(
         "--layout",
-        choices=("dataset", "nvs"),
+        choices=("dataset", "nvs", "iphone"),
         default="dataset",
-        help="dataset: LeRobot v3.0; nvs: one episode with held-out views and all ground truth",
+        help="dataset: LeRobot v3.0; nvs: one episode with held-out views and all ground truth; "
+        "iphone: one episode in the layout of DyCheck's sequences, with Shape of Motion's package",
     )
     parser.add_argument("--kind", choices=KINDS, default="push", help="what moves")
     parser.add_argument("--episodes", type=int, default=2, help="episodes at the same desk (layout dataset)")
@@ -48,8 +50,10 @@ def main(arguments: list[str] | None = None) -> int:
         scenes = [make_scene(a.kind, a.seed, a.frames, a.width, a.height, a.fps, episode=e) for e in range(count)]
         if a.layout == "dataset":
             write_dataset(scenes, f"synthetic/{a.out.name}", a.out, cameras=a.cameras, depth=a.depth)
-        else:
+        elif a.layout == "nvs":
             write_nvs_folder(scenes[0], a.out)
+        else:
+            write_iphone_folder(scenes[0], a.out)
     except MsdynError as error:
         logger.error("%s: %s", type(error).__name__, error)
         return 2

@@ -57,6 +57,17 @@ def recorded_cameras(world_from_gripper: np.ndarray, width: int, height: int) ->
     }
 
 
+def hand_held_camera(frames: int, width: int, height: int, sway_deg: float = 4.0) -> CameraTrack:
+    """A camera that goes to and fro about the front camera's place, up to `sway_deg` of azimuth, half of elevation."""
+    phase = np.linspace(0, 2 * math.pi, frames)
+    poses = [
+        _orbit(sway_deg * math.sin(angle), ELEVATION + 0.5 * sway_deg * math.sin(2 * angle), DISTANCE)
+        for angle in phase.tolist()
+    ]
+    intrinsics = intrinsics_from_fov(width, height, FOV).expand(frames, 3, 3).contiguous()
+    return CameraTrack(intrinsics, torch.from_numpy(np.stack(poses)).float(), width, height)
+
+
 def heldout_cameras(frames: int, width: int, height: int) -> dict[str, CameraTrack]:
     """The front camera moved by 5 and 10 degrees of azimuth, 8 of elevation, 5 cm sideways and 12 % closer."""
     return {name: _fixed(pose, frames, width, height) for name, pose in HELDOUT.items()}
