@@ -75,7 +75,7 @@ def run(arguments: list[str]) -> int:
     if kind is None:
         raise ConfigError(f"which evaluation? got {name!r}; expected: {COMMAND} {' | '.join(EVALUATIONS)} (--help)")
     command = f"{COMMAND} {name}"
-    config = parse_config(kind.config, arguments[1:], kind.needed, command=command)
+    config: Any = parse_config(kind.config, arguments[1:], kind.needed, command=command)
     empty = kind.config()
     for flag, path in kind.needed.items():
         if _value(config, path) == _value(empty, path):

@@ -6,6 +6,7 @@ and masks of Shape of Motion's package (Wang et al. 2025), which later papers fo
 
 import math
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -54,7 +55,12 @@ def evaluate_dycheck(config: DycheckConfig) -> Evaluated:
     empty = sum(math.isnan(scores["mpsnr"]) for scores in images.values())
     notices = [missing, f"{empty} of {len(images)} masks are empty: without mPSNR" if empty else ""]
     rows = {"this fit": mean_scores([*images.values()]), "recorded picture of that time": mean_scores(unchanged)}
-    content = {"sequence": config.root.name, "protocol": config.protocol, "mean": rows, "images": images}
+    content: dict[str, Any] = {
+        "sequence": config.root.name,
+        "protocol": config.protocol,
+        "mean": rows,
+        "images": images,
+    }
     content |= {"seconds": seconds, "pictures": len(images), "notices": [notice for notice in notices if notice]}
     table = score_table(rows, f"{config.root.name}, protocol {config.protocol}")
     return Evaluated(content, table, config.out).written()

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -25,7 +26,7 @@ def read_priors(sequence: IphoneSequence, width: int) -> Exchange:
     size = (min(width, full_width), round(full_height * min(width, full_width) / full_width))
     masks, depth = folder / "track_anything" / "1x", folder / "aligned_depth_anything_colmap" / "1x"
     tracks = folder / "2d_tracks" / "1x"
-    found: dict[str, ndarray] = {}
+    found: dict[str, Any] = {}
     if masks.is_dir():
         found["masks"] = np.stack([_mask(masks / f"{name}.png", size) for name in names])
     if depth.is_dir():

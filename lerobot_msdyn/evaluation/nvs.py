@@ -48,7 +48,12 @@ def evaluate_nvs(config: EvaluateConfig) -> Evaluated:
                 cameras[path.stem] = score_views(drawn, truth)
     mean = mean_scores([*cameras.values()])
     notices = [without_flip()] if cameras else ["no scores: no true views with covis in gt/heldout"]
-    content = {"scene": config.scene_folder.name, "cameras": cameras, "mean": mean, "pictures": pictures}
+    content: dict[str, Any] = {
+        "scene": config.scene_folder.name,
+        "cameras": cameras,
+        "mean": mean,
+        "pictures": pictures,
+    }
     content |= {"seconds": seconds, "notices": [notice for notice in notices if notice]}
     return Evaluated(content, score_table(cameras | {"mean": mean}) if cameras else "", config.out).written()
 
