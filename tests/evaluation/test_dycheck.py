@@ -1,0 +1,50 @@
+"""Sequences from the command line: fitted, drawn and scored by both protocols."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from lerobot_msdyn import evaluate
+from lerobot_msdyn.config import Protocol
+from lerobot_msdyn.evaluation.iphone import read_sequence
+from lerobot_msdyn.evaluation.metrics import masked_psnr_db, partial_ssim
+from lerobot_msdyn.synthetic import make_scene, write_iphone_folder
+
+FAST = ("--fit.steps", "30", "--scene.moving_frames", "4", "--scene.overlay", "false")
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("dycheck") / "push"
+    write_iphone_folder(make_scene("push", 0, 12, 80, 60), root)
+    return root
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("protocol", ["som", "dycheck"])
+def test_the_fit_beats_the_recorded_picture(
+    sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], protocol: Protocol
+) -> None:
+    if protocol == "som":
+        pytest.importorskip("pycolmap")
+    arguments = ["dycheck", "--root", str(sequence), "--out", str(tmp_path), "--protocol", protocol]
+    assert evaluate.run([*arguments, *FAST]) == 0
+    said = capsys.readouterr().out
+    assert f"protocol {protocol}" in said
+    assert "mLPIPS is left out" in said
+    found = json.loads((tmp_path / "scores.json").read_text())
+    fitted, unchanged = found["mean"]["this fit"], found["mean"]["recorded picture of that time"]
+    assert fitted["mpsnr"] > unchanged["mpsnr"] + 2
+    assert fitted["mssim"] > unchanged["mssim"]
+    truth = read_sequence(sequence, protocol)
+    assert sorted(path.stem for path in (tmp_path / "rgb").iterdir()) == sorted(truth.validation)
+    for name in truth.validation:  # the scores are those of the pictures that were written
+        drawn = cv2.imread(str(tmp_path / "rgb" / f"{name}.png"), cv2.IMREAD_COLOR_RGB)
+        true, mask = truth.true_picture(name), truth.covisible(name)
+        assert found["images"][name]["mpsnr"] == pytest.approx(masked_psnr_db(drawn, true, mask), abs=1e-4)
+        assert found["images"][name]["mssim"] == pytest.approx(partial_ssim(drawn, true, mask), abs=1e-4)
+    means = {score: np.mean([image[score] for image in found["images"].values()]) for score in fitted}
+    assert fitted == pytest.approx(means, abs=1e-4)
