@@ -1,5 +1,7 @@
-"""Held-out views: rendered where the documentation says, from nothing but the documented files."""
+"""Held-out views: rendered where the documentation says, from nothing but the documented files; and scored."""
 
+import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -58,10 +60,16 @@ def test_views_are_close_to_the_true_ones(folder: Path, tmp_path: Path, capsys: 
     said = capsys.readouterr().out
     assert all(stage in said for stage in ("read", "priors and initialisation", "fit", "render"))
     cameras = sorted(path.stem for path in (folder / "gt" / "heldout").glob("*.npz"))
-    assert sorted(path.name for path in tmp_path.iterdir()) == cameras
+    assert sorted(path.name for path in tmp_path.iterdir()) == [*cameras, "scores.json"]
+    assert "| mean |" in said
+    scores = json.loads((tmp_path / "scores.json").read_text())
+    assert sorted(scores["cameras"]) == cameras
     # Measured at this small size: 20.8, 22.2, 21.6, 22.1 dB.
     for camera in ("az-10", "az+05", "el+08", "tx-05"):
         assert psnr(folder, tmp_path, camera) > max(19.8, unchanged_psnr(folder, camera) + 4), camera
+        # The one is of the mean error, the other the mean over the frames.
+        assert scores["cameras"][camera]["psnr"] == pytest.approx(psnr(folder, tmp_path, camera), abs=0.3)
+        assert "dyn_psnr" not in scores["cameras"][camera]  # gt/meta.json, which tells what moves, is not there
 
 
 def test_depth_from_a_file(folder: Path, tmp_path: Path) -> None:
@@ -74,9 +82,14 @@ def test_depth_from_a_file(folder: Path, tmp_path: Path) -> None:
     assert psnr(folder, out, "az+05") > 18
 
 
-def test_without_depth(folder: Path, tmp_path: Path) -> None:
-    assert run("nvs", "--scene", str(folder), "--out", str(tmp_path), "--depth", "none", "--fit.steps", "2") == 0
-    assert len(list(tmp_path.rglob("*.png"))) > 10
+def test_without_depth_and_without_truth(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    blind, out = tmp_path / "blind", tmp_path / "out"
+    shutil.copytree(folder, blind, ignore=shutil.ignore_patterns("*.mkv", "az*", "el*", "tx*", "dolly"))
+    shutil.copy(folder / "gt" / "heldout" / "az+05.npz", blind / "gt" / "heldout")
+    assert run("nvs", "--scene", str(blind), "--out", str(out), "--depth", "none", "--fit.steps", "2") == 0
+    assert len(list(out.rglob("*.png"))) > 3
+    assert "no scores" in capsys.readouterr().out
+    assert json.loads((out / "scores.json").read_text())["cameras"] == {}
 
 
 @pytest.mark.parametrize(
@@ -87,6 +100,10 @@ def test_without_depth(folder: Path, tmp_path: Path) -> None:
         (["nvs", "--out", "x"], "--scene is missing"),
         (["nvs", "--scene", "x"], "--out is missing"),
         (["nvs", "--scene", "absent", "--out", "x"], "train.npz: expected an npz file with K, c2w"),
+        (["dycheck", "--out", "x"], "--root is missing"),
+        (["dycheck", "--root", "absent", "--out", "x"], "train.json: cannot be read"),
+        (["dycheck", "--root", "x", "--out", "x", "--protocol", "nerfies"], "protocol"),
+        (["heldout-camera", "--repo", "x", "--train-camera", "a", "--test-camera", "b"], "--calibration is missing"),
     ],
 )
 def test_bad_input(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:

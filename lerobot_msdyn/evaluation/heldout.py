@@ -53,7 +53,7 @@ def evaluate_heldout(config: HeldoutCameraConfig) -> Evaluated:
     with timed(seconds, "score"):
         moving = estimate_masks(held_out, config.priors, config.camera, episode=config.episode, key=test).numpy() > 0
         truth = TrueViews(held_out.rgb.numpy(), np.where(covered, SEEN, NEVER).astype(np.uint8), moving)
-        rows = {name: _score(pictures, truth) for name, pictures in shown.items()}
+        rows = {name: score_half(pictures, truth) for name, pictures in shown.items()}
     notices = [without_flip(), "" if scene.metric else "no depth warp: the depth is not metric, nor is the fit's place"]
     content: dict[str, Any] = {"train_camera": train, "test_camera": test, "depth_from": helpers, "rows": rows}
     content |= {"depth": scene.provenance["depth"], "covered": float(covered.mean()), "pictures": len(drawn)}
@@ -109,7 +109,7 @@ def _warped(scene: Reconstruction, view: View, camera: CameraTrack) -> Pictures:
     return np.stack(found)
 
 
-def _score(drawn: Pictures, truth: TrueViews) -> Scores:
+def score_half(drawn: Pictures, truth: TrueViews) -> Scores:
     """Scores of the one half of the frames, in colours fitted to the other half."""
     colours = fit_colours(drawn[FIT], truth.rgb[FIT], truth.seen[FIT] != NEVER)
     scored = TrueViews(truth.rgb[SCORED], truth.seen[SCORED], None if truth.moving is None else truth.moving[SCORED])

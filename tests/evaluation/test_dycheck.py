@@ -1,5 +1,6 @@
 """Sequences from the command line: fitted, drawn and scored by both protocols."""
 
+import importlib
 import json
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 
 from lerobot_msdyn import evaluate
 from lerobot_msdyn.config import Protocol
+from lerobot_msdyn.errors import ConfigError
 from lerobot_msdyn.evaluation.iphone import read_sequence
 from lerobot_msdyn.evaluation.metrics import masked_psnr_db, partial_ssim
 from lerobot_msdyn.synthetic import make_scene, write_iphone_folder
@@ -48,3 +50,26 @@ def test_the_fit_beats_the_recorded_picture(
         assert found["images"][name]["mssim"] == pytest.approx(partial_ssim(drawn, true, mask), abs=1e-4)
     means = {score: np.mean([image[score] for image in found["images"].values()]) for score in fitted}
     assert fitted == pytest.approx(means, abs=1e-4)
+
+
+def test_the_table_of_five_sequences(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """From scores that are there already: means over all five, beside published rows of the same protocol only."""
+    monkeypatch.syspath_prepend(Path(__file__).parent.parent.parent / "benchmarks")
+    benchmark = importlib.import_module("dycheck")
+    for i, name in enumerate(benchmark.SEQUENCES):
+        (tmp_path / name).mkdir()
+        mean = {"this fit": {"mpsnr": 15.0 + i, "mssim": 0.6}}
+        (tmp_path / name / "scores.json").write_text(json.dumps({"protocol": "som", "mean": mean}))
+    arguments = ["--data", str(tmp_path), "--out", str(tmp_path)]
+    assert benchmark.main(arguments) == 0
+    said = capsys.readouterr().out
+    assert "| this fit, spin | 18.00 | 0.600 | - |" in said
+    assert "| this fit, mean | 17.00 | 0.600 | - |" in said
+    assert "| published: the paper | 17.07 | 0.66 | 0.38 |" in said
+    assert "T-NeRF (DyCheck)" not in said
+    with pytest.raises(ConfigError, match="is of protocol som, not dycheck"):
+        benchmark.main([*arguments, "--protocol", "dycheck"])
+    assert benchmark.main([*arguments, "--sequences", "apple", "spin"]) == 0
+    assert "this fit, mean" not in capsys.readouterr().out
