@@ -93,6 +93,10 @@ class OutputDataset:
         pictures = stage_pictures(self.source, folder, frames, int(self.source.episodes[index]["length"]))
         return NewEpisode(index, provenance, pictures)
 
+    def is_finished(self, index: int) -> bool:
+        """Whether all new episodes of one source episode are made."""
+        return self.episode(index).has(FINISHED)
+
     def finish_episode(self, index: int, make: Callable[[], list[NewEpisode]]) -> list[NewEpisode]:
         """All new episodes of one source episode, made once; what the source has to offer is copied and checked first.
 
