@@ -16,7 +16,7 @@ from lerobot_msdyn.errors import ConfigError, EpisodeError, MsdynError
 from lerobot_msdyn.estimate import measure_speeds, predicted_seconds
 from lerobot_msdyn.pipeline import augment_episode
 from lerobot_msdyn.video import quiet_encoders
-from lerobot_msdyn.workers import Work, Workers, workers_for
+from lerobot_msdyn.workers import Work, Workers, threads_of_one, workers_for
 from lerobot_msdyn.write import NewEpisode, OutputDataset
 
 logger = logging.getLogger(__name__)
@@ -107,13 +107,16 @@ def plan(source: LeRobotDatasetMetadata, episodes: list[int], cameras: list[str]
     copies = config.variants + int(config.include_source)
     size = sum(file.stat().st_size for file in source.root.rglob("*") if file.is_file())
     disk = size * frames * copies / max(source.total_frames, 1)
-    seconds = predicted_seconds(measure_speeds(source, episodes[0], cameras, config), source, episodes, config)
+    count = workers_for(config, frames, len(episodes))
+    with threads_of_one(count):
+        speeds = measure_speeds(source, episodes[0], cameras, config)
+    seconds = predicted_seconds(speeds, source, episodes, config, count)
     return (
         f"{source.repo_id}: {len(episodes)} episodes, {frames} frames; re-rendering {', '.join(cameras)}\n"
         f"{config.variants} new per episode: {len(episodes) * copies} episodes, {frames * copies} frames, "
         f"{frames * config.variants * len(cameras)} new pictures\n"
         f"about {disk / 1e6:.0f} MB on disk, and about {seconds / 60:.1f} minutes on this machine, "
-        "judging by a few frames and steps\n"
+        f"by {count} {'process' if count == 1 else 'processes'}, judging by a few frames and steps\n"
     )
 
 

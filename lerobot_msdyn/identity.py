@@ -69,7 +69,9 @@ def code_digest() -> str:
 def recipe_text(config: Recipe) -> str:
     """The settings as a recipe file, without the user's folders."""
     known = {item.name for item in dataclasses.fields(Recipe)}
-    return yaml.safe_dump({key: value for key, value in draccus.encode(config).items() if key in known})
+    settings = {key: value for key, value in draccus.encode(config).items() if key in known}
+    settings["priors"].pop("cache")
+    return yaml.safe_dump(settings)
 
 
 def _named_files(settings: Any) -> list[Path]:

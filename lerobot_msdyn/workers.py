@@ -79,6 +79,21 @@ def workers_for(config: AugmentConfig, frames: int, episodes: int) -> int:
     return max(1, min(wanted, episodes))
 
 
+@contextlib.contextmanager
+def threads_of_one(count: int) -> Iterator[None]:
+    """This process on as many threads as each of some workers has."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(_share_of_threads(count))
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _share_of_threads(count: int) -> int:
+    return max(1, torch.get_num_threads() // count)
+
+
 def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -100,7 +115,7 @@ class Workers:
         theirs, self._ours = context.Pipe(duplex=False)
         self._said: Queue = context.Queue()
         self._listener = threading.Thread(target=_listen, args=(self._said, work.progress), daemon=True)
-        threads = max(1, _cores() // count)
+        threads = _share_of_threads(count)
         self._pool = ProcessPoolExecutor(count, context, _begin, (place, threads, theirs, self._said))
 
     def __enter__(self) -> "Workers":
