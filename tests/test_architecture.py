@@ -32,6 +32,7 @@ ONLY_IN = {
         "sharing",
         "pipeline",
         "estimate",
+        "workers",
         "engines",
         "report",
         "augment",
