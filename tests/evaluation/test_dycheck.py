@@ -13,16 +13,8 @@ from lerobot_msdyn.config import Protocol
 from lerobot_msdyn.errors import ConfigError
 from lerobot_msdyn.evaluation.iphone import read_sequence
 from lerobot_msdyn.evaluation.metrics import masked_psnr_db, partial_ssim
-from lerobot_msdyn.synthetic import make_scene, write_iphone_folder
 
 FAST = ("--fit.steps", "30", "--scene.moving_frames", "4", "--scene.overlay", "false")
-
-
-@pytest.fixture(scope="module")
-def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("dycheck") / "push"
-    write_iphone_folder(make_scene("push", 0, 12, 80, 60), root)
-    return root
 
 
 @pytest.mark.slow

@@ -15,22 +15,16 @@ from lerobot_msdyn.config import Protocol
 from lerobot_msdyn.errors import DatasetError
 from lerobot_msdyn.evaluation.iphone import read_sequence
 from lerobot_msdyn.evaluation.iphone_priors import read_priors
-from lerobot_msdyn.synthetic import make_scene, write_iphone_folder
+from lerobot_msdyn.synthetic.scene import SyntheticScene
 from lerobot_msdyn.synthetic.viewpoints import hand_held_camera, heldout_cameras
 
-FRAMES, WIDTH, HEIGHT = 12, 80, 60
-
-
-@pytest.fixture(scope="session")
-def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A made-up sequence in both layouts."""
-    root = tmp_path_factory.mktemp("iphone") / "push"
-    write_iphone_folder(make_scene("push", 0, FRAMES, WIDTH, HEIGHT), root)
-    return root
+FRAMES, WIDTH, HEIGHT = 12, 80, 60  # of `sequence`
 
 
 @pytest.mark.parametrize(("protocol", "factor"), [("som", 1), ("dycheck", 2)])
-def test_what_is_read_is_what_was_written(sequence: Path, protocol: Protocol, factor: int) -> None:
+def test_what_is_read_is_what_was_written(
+    sequence: Path, push: SyntheticScene, protocol: Protocol, factor: int
+) -> None:
     if protocol == "som":
         pytest.importorskip("pycolmap")
     found = read_sequence(sequence, protocol)
@@ -45,19 +39,18 @@ def test_what_is_read_is_what_was_written(sequence: Path, protocol: Protocol, fa
     expected = torch.cat((truth["az+10"].world_from_camera, truth["el+08"].world_from_camera))
     torch.testing.assert_close(found.cameras.world_from_camera, expected, atol=1e-5, rtol=0)
     torch.testing.assert_close(found.cameras.intrinsics[:3], truth["az+10"].intrinsics)
-    scene = make_scene("push", 0, FRAMES, WIDTH, HEIGHT)
-    seen = scene.render(truth["el+08"], [0, 5, 10])
+    seen = push.render(truth["el+08"], [0, 5, 10])
     assert (found.true_picture("2_00005") == seen.rgb[1].numpy()).all()
     assert 0.6 < found.covisible("2_00005").mean() <= 1
     assert found.view.depth is not None
-    torch.testing.assert_close(found.view.depth, scene.render(hand_held).depth)
+    torch.testing.assert_close(found.view.depth, push.render(hand_held).depth)
 
 
-def test_priors_of_the_package(sequence: Path) -> None:
+def test_priors_of_the_package(sequence: Path, push: SyntheticScene) -> None:
     pytest.importorskip("pycolmap")
     found = read_sequence(sequence, "som")
     priors = read_priors(found, WIDTH // 2)
-    seen = make_scene("push", 0, FRAMES, WIDTH, HEIGHT).render(hand_held_camera(FRAMES, WIDTH, HEIGHT))
+    seen = push.render(hand_held_camera(FRAMES, WIDTH, HEIGHT))
     assert priors.masks is not None
     assert priors.depth is not None
     assert priors.tracks is not None
