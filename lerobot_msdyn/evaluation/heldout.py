@@ -22,6 +22,8 @@ from lerobot_msdyn.priors import estimate_masks
 from lerobot_msdyn.views import Reconstruction, new_pictures
 
 FIT, SCORED = slice(0, None, 2), slice(1, None, 2)  # frames that colours are fitted to, and those that are scored
+BLACK = 20  # of 0..255: what the codec makes of black stays below
+BORDER_PX = 2  # beside black, where resampling mixes with it
 
 Pictures = UInt8[ndarray, "n h w 3"]
 
@@ -52,6 +54,7 @@ def evaluate_heldout(config: HeldoutCameraConfig) -> Evaluated:
             shown["depth warp"] = _warped(scene, view, held_out.camera)
     with timed(seconds, "score"):
         moving = estimate_masks(held_out, config.priors, config.camera, episode=config.episode, key=test).numpy() > 0
+        covered &= shows_something(held_out.rgb.numpy())
         truth = TrueViews(held_out.rgb.numpy(), np.where(covered, SEEN, NEVER).astype(np.uint8), moving)
         rows = {name: score_half(pictures, truth) for name, pictures in shown.items()}
     notices = [without_flip(), "" if scene.metric else "no depth warp: the depth is not metric, nor is the fit's place"]
@@ -92,6 +95,12 @@ def _drawn(scene: Reconstruction, camera: CameraTrack, out: Path) -> tuple[Pictu
         pictures.append(picture.rgb)
         covered.append(~picture.unseen)
     return np.stack(pictures), np.stack(covered)
+
+
+def shows_something(rgb: Pictures) -> Bool[ndarray, "h w"]:
+    """Pixels that are not black throughout, as the border of an undistorted picture is, nor beside such pixels."""
+    lit = (rgb.max((0, 3)) > BLACK).astype(np.uint8)
+    return cv2.erode(lit, np.ones((2 * BORDER_PX + 1,) * 2, np.uint8), borderValue=1) > 0
 
 
 def _resized(view: View, like: View) -> Pictures:

@@ -8,7 +8,7 @@ import pytest
 
 from lerobot_msdyn import evaluate
 from lerobot_msdyn.cli import run_command
-from lerobot_msdyn.evaluation.heldout import score_half
+from lerobot_msdyn.evaluation.heldout import score_half, shows_something
 from lerobot_msdyn.evaluation.scores import TrueViews
 from lerobot_msdyn.synthetic import make_scene
 
@@ -70,6 +70,14 @@ def test_colours_are_fitted_to_the_other_half_of_the_frames() -> None:
     assert score_half(drawn, TrueViews(true, seen))["psnr"] > 50
     true[1::2] += 20  # of the half that is scored: not made up for
     assert score_half(drawn, TrueViews(true, seen))["psnr"] == pytest.approx(20 * np.log10(255 / 20), abs=0.2)
+
+
+def test_the_black_border_of_undistorted_pictures_is_left_out() -> None:
+    pictures = np.random.default_rng(0).integers(0, 200, (5, 20, 30, 3)).astype(np.uint8)
+    pictures[:, :, :6] = 3
+    expected = np.ones((20, 30), bool)
+    expected[:, :8] = False
+    assert (shows_something(pictures) == expected).all()
 
 
 @pytest.mark.parametrize(
