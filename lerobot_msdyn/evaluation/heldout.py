@@ -100,7 +100,7 @@ def _drawn(scene: Reconstruction, camera: CameraTrack, out: Path) -> tuple[Pictu
 def shows_something(rgb: Pictures) -> Bool[ndarray, "h w"]:
     """Pixels that are not black throughout, as the border of an undistorted picture is, nor beside such pixels."""
     lit = (rgb.max((0, 3)) > BLACK).astype(np.uint8)
-    return cv2.erode(lit, np.ones((2 * BORDER_PX + 1,) * 2, np.uint8), borderValue=1) > 0
+    return cv2.erode(lit, np.ones((2 * BORDER_PX + 1,) * 2, np.uint8)) > 0
 
 
 def _resized(view: View, like: View) -> Pictures:
