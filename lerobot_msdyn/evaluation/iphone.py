@@ -52,13 +52,20 @@ class IphoneSequence:
 
     def true_picture(self, name: str) -> UInt8[ndarray, "h w 3"]:
         """What a validation camera saw."""
-        return read_picture(self.root / "rgb" / f"{FACTOR[self.protocol]}x" / f"{name}.png")[..., :3]
+        return self._checked(self.root / "rgb" / f"{FACTOR[self.protocol]}x" / f"{name}.png")[..., :3]
 
     def covisible(self, name: str) -> Float[ndarray, "h w"]:
         """Which of it the training frames show, 0..1."""
         folder = "covisible/2x/val" if self.protocol == "dycheck" else f"{PROCESSED}/covisible/1x/val"
-        mask = read_picture(self.root / folder / f"{name}.png")
+        mask = self._checked(self.root / folder / f"{name}.png")
         return (mask if mask.ndim == 2 else mask[..., 0]) / 255.0
+
+    def _checked(self, path: Path) -> UInt8[ndarray, "h w *c"]:
+        """A picture, which must be of the size of the fitted ones."""
+        picture, expected = read_picture(path), tuple(self.view.rgb.shape[1:3])
+        if picture.shape[:2] != expected:
+            raise DatasetError(f"{path}: is {picture.shape[:2]} (height, width), the fitted pictures are {expected}")
+        return picture
 
 
 def read_sequence(root: Path, protocol: Protocol) -> IphoneSequence:

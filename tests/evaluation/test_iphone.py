@@ -84,6 +84,14 @@ def test_without_the_package_only_the_cameras_are_demanded(sequence: Path, tmp_p
         read_sequence(root, "som")
 
 
+def test_a_mask_of_another_size_is_named(sequence: Path, tmp_path: Path) -> None:
+    root = tmp_path / "small"
+    shutil.copytree(sequence, root, ignore=shutil.ignore_patterns("flow3d_preprocessed"))
+    cv2.imwrite(str(root / "covisible" / "2x" / "val" / "1_00005.png"), np.zeros((8, 9), np.uint8))
+    with pytest.raises(DatasetError, match=r"1_00005.png: is \(8, 9\) \(height, width\), the fitted"):
+        read_sequence(root, "dycheck").covisible("1_00005")
+
+
 def _no_validation(root: Path) -> None:
     (root / "splits" / "val.json").write_text(json.dumps({"frame_names": [], "time_ids": []}))
 
