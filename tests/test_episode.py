@@ -8,8 +8,8 @@ import pytest
 import torch
 from lerobot.datasets import LeRobotDataset
 
-from lerobot_msdyn.config import CameraConfig
 from lerobot_msdyn.chroma import restore_chroma
+from lerobot_msdyn.config import CameraConfig
 from lerobot_msdyn.episode import open_source, read_episode, select_cameras, select_episodes
 from lerobot_msdyn.errors import DatasetError, EpisodeError
 
