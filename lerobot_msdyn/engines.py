@@ -8,8 +8,9 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from lerobot_msdyn.config import AugmentConfig
+from lerobot_msdyn.devices import chosen_device
 from lerobot_msdyn.episode import depth_key_of
-from lerobot_msdyn.errors import ConfigError, EpisodeError, MsdynError
+from lerobot_msdyn.errors import EpisodeError, MsdynError
 from lerobot_msdyn.estimate import measure_speeds, predicted_seconds
 from lerobot_msdyn.pipeline import augment_episode
 from lerobot_msdyn.sharing import shared_backgrounds
@@ -27,8 +28,7 @@ def run_local(
     output: OutputDataset,
 ) -> tuple[list[NewEpisode], list[EpisodeError]]:
     """All episodes in this process; an episode that cannot be read is reported and left out."""
-    if config.device == "cuda":
-        raise ConfigError("device is 'cuda', which this version cannot draw on; use --device cpu")
+    chosen_device(config.device)  # complains, or says what is used, before anything is done
     quiet_encoders()
     _say_what_is_assumed(source, cameras, config)
     new: list[NewEpisode] = []
