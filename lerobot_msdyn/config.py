@@ -319,8 +319,10 @@ class Recipe:
     save_scenes: bool = False
     # Seed of every random choice; together with the episode and the variant it fixes the result.
     seed: int = 0
-    # auto, cpu or cuda.
+    # auto, cpu or cuda; auto takes a GPU where everything is there to draw on it (docs/gpu.md).
     device: Device = "auto"
+    # Whether a GPU encodes new H.264 and HEVC videos where it can: faster, but not as the source's encoder would.
+    nvenc: bool = False
     camera: CameraConfig = field(default_factory=CameraConfig)
     priors: PriorsConfig = field(default_factory=PriorsConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)
@@ -362,6 +364,8 @@ class AugmentConfig(Recipe):
     episodes: list[int] | None = None
     # Report what would be done (episodes, disk, time) and stop.
     dry_run: bool = False
+    # Episodes in work at the same time; more than one fills a GPU that waits for the processor (docs/gpu.md).
+    episodes_at_once: int = 1
     # Throw away what an unfinished run for the same output has finished, instead of going on with it.
     restart: bool = False
     # Work on a converted copy of a source of version v2.1; the source stays as it is.
@@ -526,7 +530,7 @@ _SHIFT = (("translation_m", 0, 10), ("translation_rel", 0, 0.9))
 # Class -> (field, smallest, largest value).
 _RANGES: dict[str, tuple[tuple[str, float, float], ...]] = {
     "Recipe": _RECIPE_RANGES,
-    "AugmentConfig": _RECIPE_RANGES,
+    "AugmentConfig": (*_RECIPE_RANGES, ("episodes_at_once", 1, 64)),
     "EvaluateConfig": _RECIPE_RANGES,
     "ViewerConfig": _RECIPE_RANGES,
     "PriorsCommandConfig": (*_RECIPE_RANGES, ("columns", 1, 100)),

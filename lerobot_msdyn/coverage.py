@@ -55,17 +55,16 @@ def evidence_of(scene: DynamicScene, camera: CameraTrack, empty: EmptyScene) -> 
 
     It is on the device of the scene, as the camera and `empty` need not be.
     """
-    camera = to_device(camera, scene.device)
     visible = torch.zeros(len(scene.moving), device=scene.device)
     frames = torch.linspace(0, scene.frames - 1, min(scene.frames, SAMPLES)).round().long()
     if len(scene.moving) > 0:
         for frame in frames.split(1):
-            pose = camera.select(frame)
+            pose = to_device(camera.select(frame), scene.device)
             means = scene.at(frame).means[0, len(scene.static) :]
             depth = draw(scene, pose, frame).depth[0]
             visible += _in_front(means, pose, depth, torch.ones_like(depth)).float()
-    shown = to_device((fill_depth(empty.depth), empty.seen), scene.device)
-    return Evidence(camera, *shown, visible * (scene.frames / len(frames)))
+    shown = to_device((camera, fill_depth(empty.depth), empty.seen), scene.device)
+    return Evidence(*shown, visible * (scene.frames / len(frames)))
 
 
 def coverage_of(
@@ -83,7 +82,8 @@ def coverage_of(
     camera, found = to_device(camera, rendering.depth.device), []
     for i, time in enumerate(times.tolist()):
         depth, alpha = rendering.depth[i], rendering.alpha[i]
-        recorded = evidence.camera.select([min(time, len(evidence.camera) - 1)])
+        nearest = min(time, len(evidence.camera) - 1)
+        recorded = evidence.camera.select(slice(nearest, nearest + 1))
         in_camera = unproject_image(depth, camera.intrinsics[i]).reshape(-1, 3)
         points = transform_points(camera.world_from_camera[i], in_camera)
         still = _in_front(points, recorded, evidence.depth, evidence.frames).reshape(depth.shape)
@@ -122,7 +122,7 @@ def _in_front(
 
 def is_behind(evidence: Evidence, places: Float[Tensor, "n 3"]) -> bool:
     """Whether any of some places (m, world) is behind what stands still before the recorded camera."""
-    camera = evidence.camera.select([0])
+    camera = evidence.camera.select(slice(1))
     places = places.to(evidence.depth.device)
     xy, z = project(transform_points(camera.camera_from_world[0], places), camera.intrinsics[0])
     inside = (z > 0) & (xy >= 0).all(-1) & (xy[:, 0] < camera.width) & (xy[:, 1] < camera.height)
