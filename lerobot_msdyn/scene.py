@@ -110,7 +110,7 @@ class Snapshot:
 
 def patched(snapshot: Snapshot, patch: FramePatch) -> Snapshot:
     """A snapshot of one frame, with a patch in place of what the patch hides; the patch counts as moving."""
-    kept, ones = ~patch.hidden, patch.means.new_ones(len(patch))
+    kept, ones = (~patch.hidden).nonzero()[:, 0], patch.means.new_ones(len(patch))
     return Snapshot(
         means=torch.cat((snapshot.means[:, kept], patch.means[None]), dim=1),
         quats=torch.cat((snapshot.quats[:, kept], patch.quats[None]), dim=1),

@@ -1,6 +1,7 @@
 """A CUDA device that is not there: tensors without values, which tell what is copied from it and what is waited for.
 
-On it no real tensor can take part, as on a GPU no tensor of the host can; what is read from it is one or true.
+No tensor of the host can take part there, as on a GPU; masks select nothing there, since what they select is not known.
+What is read from it is one or true.
 """
 
 import traceback
@@ -27,7 +28,7 @@ _ANSWERS: dict[str, Callable[[Tensor], Any]] = {
 
 
 class FakeGpu(TorchFunctionMode):
-    """Within, the device cuda can be used; `waits` and `copies` list the lines of the package that made the host wait."""
+    """Within, the device cuda can be used; `waits` and `copies` say what made the host wait, and what copied."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -48,9 +49,10 @@ class FakeGpu(TorchFunctionMode):
             if name == "cpu" or (name == "to" and torch.device("cpu") in _devices(args[1:], kwargs)):
                 self.copies.append(_caller())
                 return torch.ones(first.shape, dtype=first.dtype)
-            if name == "__getitem__" and any(_is_mask(index) for index in _tuple(args[1])):
+            if name == "nonzero":  # of one dimension: all of it
                 self.waits.append(_caller())
-                return first[tuple(slice(None) if _is_mask(index) else index for index in _tuple(args[1]))]
+                with self.mode:
+                    return torch.arange(len(first), device=first.device)[:, None]
         if torch.device("cuda") in _devices(args, kwargs):  # copied to it, or made there
             with self.mode:
                 plain = isinstance(first, Tensor) and not isinstance(first, FakeTensor)
@@ -67,16 +69,8 @@ def _devices(args: Any, kwargs: dict) -> list[torch.device]:
     return [torch.device(torch.device(value).type) for value in given if str(value).split(":")[0] in ("cpu", "cuda")]
 
 
-def _tuple(index: Any) -> tuple:
-    return index if isinstance(index, tuple) else (index,)
-
-
-def _is_mask(index: Any) -> bool:
-    return isinstance(index, FakeTensor) and index.dtype == torch.bool
-
-
 def _caller() -> str:
-    """The line of the package that is being run, as "module function"."""
+    """The line of the package that is being run, as "file function"."""
     package = lerobot_msdyn.__path__[0]
     frames = [frame for frame in traceback.extract_stack() if frame.filename.startswith(package)]
     return f"{frames[-1].filename.removeprefix(package + '/')} {frames[-1].name}" if frames else "test"

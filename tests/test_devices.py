@@ -1,4 +1,4 @@
-"""Fit, scores and rendering on a GPU: nothing of the host is mixed in, and what makes the host wait is known by name."""
+"""Fit, scores and rendering on a GPU: nothing of the host is mixed in, and what the host waits for is known."""
 
 from collections import Counter
 from dataclasses import replace
@@ -82,7 +82,6 @@ def test_a_fit_stays_on_the_gpu(gpu: FakeGpu) -> None:
     assert set(waits) - every_step == {"motion/bases.py _moves", "fitting.py psnr", "fitting.py _result"}
     per_measured_frame = {"values.py to_device", "brightness.py _seen_sums", "fitting.py fit"}
     assert {place for place, count in Counter(gpu.copies).items() if count > FRAMES} <= per_measured_frame
-    print(Counter(gpu.copies))
 
 
 def test_what_is_made_of_a_fit(gpu: FakeGpu) -> None:
@@ -100,7 +99,7 @@ def test_what_is_made_of_a_fit(gpu: FakeGpu) -> None:
         gpu.waits.clear()
         gpu.copies.clear()
         pictures = list(new_pictures(drawn, view.camera, fill="none"))
-        print(Counter(gpu.waits), Counter(gpu.copies))
+        open("/tmp/cuda/counts", "w").write(str(Counter(gpu.waits)) + str(Counter(gpu.copies)))  # noqa
         filled = list(new_pictures(drawn, view.camera))
         scores = judge(drawn.windows, view.camera)
         shares = [found.unseen_share for found in coverages(drawn, view.camera)]
