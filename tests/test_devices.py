@@ -99,13 +99,17 @@ def test_what_is_made_of_a_fit(gpu: FakeGpu) -> None:
         gpu.waits.clear()
         gpu.copies.clear()
         pictures = list(new_pictures(drawn, view.camera, fill="none"))
-        open("/tmp/cuda/counts", "w").write(str(Counter(gpu.waits)) + str(Counter(gpu.copies)))  # noqa
+        waits, copies = Counter(gpu.waits), Counter(gpu.copies)
         filled = list(new_pictures(drawn, view.camera))
         scores = judge(drawn.windows, view.camera)
         shares = [found.unseen_share for found in coverages(drawn, view.camera)]
     assert all(tensor.device.type == "cpu" for tensor in host[0].scene.tensors().values())
     assert len(pictures) == len(filled) == len(shares) == FRAMES
     assert np.isfinite(scores.expected_db)
+    waits.pop("overlay.py _first")
+    assert waits == {"scene.py patched": FRAMES, "motion/bases.py _moves": 1}
+    batches = -(-FRAMES // 8)
+    assert copies == {"values.py to_device": 4 * FRAMES + 2 * batches}  # coverage; pictures and depth
 
 
 def test_values_keep_their_structure() -> None:
