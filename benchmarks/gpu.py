@@ -231,7 +231,7 @@ def _dataset(root: Path, episodes: int, frames: int, width: int, height: int) ->
 def _augmented(root: Path, out: Path, options: argparse.Namespace, target: Device, at_once: int = 1) -> float:
     """Seconds of the command."""
     flags = {"repo": "local/bench", "root": root, "new_root": out, "recipe": options.recipe, "variants": 2}
-    flags |= {"device": target.backend, "priors.cache": "off", "episodes_at_once": at_once, "gate.redraws": 0}
+    flags |= {"device": target.backend, "priors.cache": "off", "workers": at_once, "gate.redraws": 0}
     if options.steps is not None:
         flags["fit.steps"] = options.steps
     start = time.perf_counter()

@@ -364,8 +364,6 @@ class AugmentConfig(Recipe):
     episodes: list[int] | None = None
     # Report what would be done (episodes, disk, time) and stop.
     dry_run: bool = False
-    # Episodes in work at the same time; more than one fills a GPU that waits for the processor (docs/gpu.md).
-    episodes_at_once: int = 1
     # Throw away what an unfinished run for the same output has finished, instead of going on with it.
     restart: bool = False
     # Work on a converted copy of a source of version v2.1; the source stays as it is.
@@ -530,7 +528,7 @@ _SHIFT = (("translation_m", 0, 10), ("translation_rel", 0, 0.9))
 # Class -> (field, smallest, largest value).
 _RANGES: dict[str, tuple[tuple[str, float, float], ...]] = {
     "Recipe": _RECIPE_RANGES,
-    "AugmentConfig": (*_RECIPE_RANGES, ("episodes_at_once", 1, 64)),
+    "AugmentConfig": _RECIPE_RANGES,
     "EvaluateConfig": _RECIPE_RANGES,
     "ViewerConfig": _RECIPE_RANGES,
     "PriorsCommandConfig": (*_RECIPE_RANGES, ("columns", 1, 100)),

@@ -18,7 +18,7 @@ from lerobot_msdyn.devices import chosen_device
 from lerobot_msdyn.files import DIGEST_BYTES, digest_of_file
 
 LIBRARIES = ("lerobot_msdyn", "lerobot", "torch", "numpy", "opencv-python-headless", "av", "numba", "pyarrow")
-PLACES = ("root", "new_root", "dry_run", "restart", "episodes_at_once")  # settings that do not change what is made
+PLACES = ("root", "new_root", "dry_run", "restart")  # settings that do not change what is made
 
 
 def describe_run(root: Path, files: Iterable[Path], config: AugmentConfig) -> dict[str, Any]:

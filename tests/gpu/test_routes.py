@@ -42,5 +42,5 @@ def test_both_routes_reach_the_same_held_out_quality() -> None:
 
 def test_the_command_on_a_gpu(desk: Path, tmp_path: Path) -> None:
     flags = {"repo": "local/desk", "root": desk, "new_root": tmp_path / "new", "device": "cuda", "fit.steps": 8}
-    flags |= {"variants": 1, "episodes_at_once": 2, "save_scenes": "true"}
+    flags |= {"variants": 1, "workers": 2, "save_scenes": "true"}
     assert augment.run([f"--{name}={value}" for name, value in flags.items()]) == 0
