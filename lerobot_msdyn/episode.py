@@ -22,6 +22,7 @@ from torch import Tensor
 
 from lerobot_msdyn.cameras import CameraTrack, intrinsics_from_fov, read_calibration, static_camera
 from lerobot_msdyn.checks import check_metadata, picture_size, read_json
+from lerobot_msdyn.chroma import is_subsampled, restore_chroma
 from lerobot_msdyn.config import CameraConfig
 from lerobot_msdyn.errors import DatasetError, EpisodeError
 from lerobot_msdyn.rows import TIMESTAMP_TOLERANCE_S, first_line, read_rows, source_file, task_of
@@ -243,13 +244,14 @@ def depth_key_of(meta: LeRobotDatasetMetadata, camera: str) -> str | None:
 
 
 def read_colour(meta: LeRobotDatasetMetadata, index: int, key: str, rows: pa.Table) -> UInt8[Tensor, "t h w 3"]:
-    """All frames of one colour camera.
+    """All frames of one colour camera; chroma that was recorded at half the size is restored (`chroma`).
 
     Raises:
         EpisodeError: a frame is absent or cannot be decoded.
     """
     if key in meta.video_keys:
-        return _decode_video(meta, index, key, rows, lambda block: block.movedim(1, -1))
+        restored = restore_chroma if is_subsampled(meta.features[key]) else Tensor.contiguous
+        return _decode_video(meta, index, key, rows, lambda block: restored(block.movedim(1, -1)))
     images = [_decode_image(meta, index, key, item, cv2.IMREAD_COLOR_RGB) for item in rows[key].to_pylist()]
     return torch.from_numpy(np.stack(images))
 

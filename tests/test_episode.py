@@ -8,6 +8,7 @@ import pytest
 import torch
 from lerobot.datasets import LeRobotDataset
 
+from lerobot_msdyn.chroma import restore_chroma
 from lerobot_msdyn.config import CameraConfig
 from lerobot_msdyn.episode import open_source, read_episode, select_cameras, select_episodes
 from lerobot_msdyn.errors import DatasetError, EpisodeError
@@ -24,7 +25,8 @@ def test_an_episode_is_what_lerobot_returns(desk: Path) -> None:
         item = dataset[start + i]
         for key in (FRONT, SIDE):
             view = episode.views[key]
-            assert torch.equal(view.rgb[i].permute(2, 0, 1).float() / 255, item[key])
+            decoded = (item[key].permute(1, 2, 0) * 255).round().to(torch.uint8)
+            assert torch.equal(view.rgb[i], restore_chroma(decoded[None])[0])
             assert view.depth is not None
             assert torch.equal(view.depth[i], item[f"{key}_depth"][0])
         assert episode.state is not None
