@@ -20,8 +20,7 @@ def test_workers_share_the_memory_of_a_gpu(monkeypatch: pytest.MonkeyPatch, devi
 
 
 def test_a_full_gpu_costs_its_episode(monkeypatch: pytest.MonkeyPatch) -> None:
-    work = Mock(spec=workers.Work)
-    work.source.repo_id = "local/desk"
+    work = Mock(spec=workers.Work, source=Mock(repo_id="local/desk"), output=Mock())
     work.output.finish_episode.side_effect = torch.OutOfMemoryError("CUDA out of memory")
     monkeypatch.setattr(engines, "_make", lambda work, index: None)
     found = engines.attempt(work, 3)
