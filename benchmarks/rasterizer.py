@@ -32,6 +32,7 @@ from lerobot_msdyn.render import cpu as cpu_backend
 from lerobot_msdyn.render.types import COVARIANCE_BLUR, MIN_ALPHA
 
 WORKLOADS = {"W1": (20_000, 320, 240), "W2": (60_000, 640, 480), "W3": (5_000, 160, 120)}  # Gaussians, px, px
+LARGE = {"HD": (200_000, 1280, 720)}  # for a GPU (benchmarks/gpu.py)
 LEAST_RATIO = {"W1": 20.0, "W2": 17.0}  # forward and backward, 8 channels, 1 thread
 VECTOR_OPERATIONS = {"composite_forward": 28, "composite_backward": 48}  # per drawn pixel at 8 channels, by hand count
 SLOWER_THAN_BASELINE = 1.25  # of the ratio to the reference
@@ -58,8 +59,8 @@ class Workload:
 
 
 def make_workload(name: str, channels: int, seed: int = 0) -> Workload:
-    """One of `WORKLOADS`, with `channels` - 1 features."""
-    count, width, height = WORKLOADS[name]
+    """One of `WORKLOADS` or `LARGE`, with `channels` - 1 features."""
+    count, width, height = (WORKLOADS | LARGE)[name]
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(low: float, high: float, *shape: int) -> Tensor:

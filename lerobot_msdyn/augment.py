@@ -108,7 +108,7 @@ def augment(
     if not config.convert:
         files = source_files(source, [*episodes, *background_episodes(source, config)])
         staging.agree(describe_run(source.root, files, config), restart=config.restart)
-    with OutputDataset(source, new_repo_id, new_root, staging) as output:
+    with OutputDataset(source, new_repo_id, new_root, staging, nvenc=config.nvenc) as output:
         made, failures = run_local(source, episodes, cameras, config, output)
         new = [episode for episode in made if not episode.dropped]
         skipped = [str(failure) for failure in failures]

@@ -13,6 +13,7 @@ from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.rendering import draw
 from lerobot_msdyn.scene import DynamicScene, Gaussians
 from lerobot_msdyn.shading import Shading, encode_gain, no_shading
+from lerobot_msdyn.values import to_device
 
 BLUR_PX = 1.5  # noise, and texture that does not fit, are averaged over about this
 FIELD_STEP = 2  # px of the fitted image per pixel of the field of gains
@@ -88,7 +89,7 @@ def _grey(rgb: UInt8[ndarray, "h w 3"] | Float32[ndarray, "h w 3"]) -> Float32[n
 
 @torch.no_grad()
 def moving_gain(scene: DynamicScene, view: View, priors: Priors, backend: str = "auto") -> UInt8[Tensor, "t m"]:
-    """Coded gains by which every moving Gaussian differs from its colour over time.
+    """Coded gains by which every moving Gaussian differs from its colour over time, on the host.
 
     At every second frame, each Gaussian that is seen is compared at its pixel: the ratio of the recorded to the drawn
     picture, of moving surfaces only, blurred over pixels, averaged over time, and interpolated in time where unseen.
@@ -107,11 +108,11 @@ def moving_gain(scene: DynamicScene, view: View, priors: Priors, backend: str = 
 def _seen_sums(scene: DynamicScene, view: View, priors: Priors, frame: int, backend: str) -> Float[Tensor, "m 2"]:
     """Blurred brightness recorded and drawn at the pixel of each moving Gaussian; zero where it is not seen."""
     camera, when = view.camera.select([frame]), torch.tensor([frame])
-    drawn = draw(scene, camera, when, backend)
+    drawn = to_device(draw(scene, camera, when, backend), "cpu")
     usable = ((drawn.moving[0] > SURE_WEIGHT) & (priors.instances[frame] > 0)).numpy()
     recorded, shown = _grey(view.rgb[frame].numpy()), _grey(255 * drawn.rgb[0].numpy())
     sums = torch.from_numpy(_blurred_sums(recorded, shown, usable))
-    means = scene.at(when).means[0, len(scene.static) :]
+    means = scene.at(when).means[0, len(scene.static) :].cpu()
     xy, z = project(transform_points(camera.camera_from_world[0], means), camera.intrinsics[0])
     column, row = xy.floor().long().unbind(-1)
     inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height) & (z > 0)

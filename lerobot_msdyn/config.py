@@ -320,8 +320,10 @@ class Recipe:
     save_scenes: bool = False
     # Seed of every random choice; together with the episode and the variant it fixes the result.
     seed: int = 0
-    # auto, cpu or cuda.
+    # auto, cpu or cuda; auto takes a GPU where everything is there to draw on it (docs/gpu.md).
     device: Device = "auto"
+    # Whether a GPU encodes new H.264 and HEVC videos where it can: faster, but not as the source's encoder would.
+    nvenc: bool = False
     camera: CameraConfig = field(default_factory=CameraConfig)
     priors: PriorsConfig = field(default_factory=PriorsConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)

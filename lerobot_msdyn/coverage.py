@@ -17,6 +17,7 @@ from lerobot_msdyn.cameras import CameraTrack
 from lerobot_msdyn.geometry import project, transform_points, unproject_image
 from lerobot_msdyn.rendering import Rendering, draw
 from lerobot_msdyn.scene import DynamicScene
+from lerobot_msdyn.values import to_device
 
 HOLE_ALPHA = 0.5  # below this opacity nothing is known to be there
 BEHIND = 0.01  # share of its depth by which a point may lie behind a recorded surface and still be that surface
@@ -50,22 +51,26 @@ class Coverage:
 
 @torch.no_grad()
 def evidence_of(scene: DynamicScene, camera: CameraTrack, empty: EmptyScene) -> Evidence:
-    """What `camera` has shown of a scene: of what stands still as `empty` says, of what moves as the scene says."""
-    visible = torch.zeros(len(scene.moving))
+    """What `camera` has shown of a scene: of what stands still as `empty` says, of what moves as the scene says.
+
+    It is on the device of the scene, as the camera and `empty` need not be.
+    """
+    visible = torch.zeros(len(scene.moving), device=scene.device)
     frames = torch.linspace(0, scene.frames - 1, min(scene.frames, SAMPLES)).round().long()
     if len(scene.moving) > 0:
         for frame in frames.split(1):
-            pose = camera.select(frame)
+            pose = to_device(camera.select(frame), scene.device)
             means = scene.at(frame).means[0, len(scene.static) :]
             depth = draw(scene, pose, frame).depth[0]
             visible += _in_front(means, pose, depth, torch.ones_like(depth)).float()
-    return Evidence(camera, fill_depth(empty.depth), empty.seen, visible * (scene.frames / len(frames)))
+    shown = to_device((camera, fill_depth(empty.depth), empty.seen), scene.device)
+    return Evidence(*shown, visible * (scene.frames / len(frames)))
 
 
 def coverage_of(
     rendering: Rendering, camera: CameraTrack, times: Int[Tensor, " t"], evidence: Evidence
 ) -> list[Coverage]:
-    """Coverage of some frames.
+    """Coverage of some frames, computed on the device of the rendering and the evidence.
 
     Args:
         rendering: the frames, with the frames that show each moving Gaussian as its `extra`.
@@ -74,10 +79,11 @@ def coverage_of(
         evidence: what was recorded.
     """
     assert rendering.extra is not None
-    found = []
+    camera, found = to_device(camera, rendering.depth.device), []
     for i, time in enumerate(times.tolist()):
         depth, alpha = rendering.depth[i], rendering.alpha[i]
-        recorded = evidence.camera.select([min(time, len(evidence.camera) - 1)])
+        nearest = min(time, len(evidence.camera) - 1)
+        recorded = evidence.camera.select(slice(nearest, nearest + 1))
         in_camera = unproject_image(depth, camera.intrinsics[i]).reshape(-1, 3)
         points = transform_points(camera.world_from_camera[i], in_camera)
         still = _in_front(points, recorded, evidence.depth, evidence.frames).reshape(depth.shape)
@@ -89,7 +95,8 @@ def coverage_of(
         recorded_sight = points - recorded.world_from_camera[0, :3, 3]
         cosine = torch.nn.functional.cosine_similarity(sight, recorded_sight, dim=-1).clamp(-1, 1)
         angle = torch.rad2deg(torch.arccos(cosine)).reshape(depth.shape).masked_fill(frames == 0, 180.0)
-        found.append(Coverage((frames == 0).numpy(), angle.numpy(), frames.numpy(), empty.numpy()))
+        on_host = to_device((frames == 0, angle, frames, empty), "cpu")
+        found.append(Coverage(*(values.numpy() for values in on_host)))
     return found
 
 
@@ -115,7 +122,8 @@ def _in_front(
 
 def is_behind(evidence: Evidence, places: Float[Tensor, "n 3"]) -> bool:
     """Whether any of some places (m, world) is behind what stands still before the recorded camera."""
-    camera = evidence.camera.select([0])
+    camera = evidence.camera.select(slice(1))
+    places = places.to(evidence.depth.device)
     xy, z = project(transform_points(camera.camera_from_world[0], places), camera.intrinsics[0])
     inside = (z > 0) & (xy >= 0).all(-1) & (xy[:, 0] < camera.width) & (xy[:, 1] < camera.height)
     column, row = xy[inside].long().unbind(-1)

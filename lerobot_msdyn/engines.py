@@ -6,13 +6,15 @@ import logging
 from collections.abc import Callable, Generator
 from dataclasses import replace
 
+import torch
 from lerobot.datasets import LeRobotDatasetMetadata
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from lerobot_msdyn.config import AugmentConfig
+from lerobot_msdyn.devices import chosen_device
 from lerobot_msdyn.episode import depth_key_of
-from lerobot_msdyn.errors import ConfigError, EpisodeError, MsdynError
+from lerobot_msdyn.errors import EpisodeError, MsdynError
 from lerobot_msdyn.estimate import measure_speeds, predicted_seconds
 from lerobot_msdyn.pipeline import augment_episode
 from lerobot_msdyn.video import quiet_encoders
@@ -30,8 +32,7 @@ def run_local(
     output: OutputDataset,
 ) -> tuple[list[NewEpisode], list[EpisodeError]]:
     """All episodes on this machine; an episode that cannot be read is reported and left out."""
-    if config.device == "cuda":
-        raise ConfigError("device is 'cuda', which this version cannot draw on; use --device cpu")
+    chosen_device(config.device)  # complains, or says what is used, before anything is done
     quiet_encoders()
     _say_what_is_assumed(source, cameras, config)
     new: list[NewEpisode] = []
@@ -81,6 +82,10 @@ def attempt(work: Work, index: int) -> str | None:
         return str(error)
     except MsdynError:
         raise
+    except torch.OutOfMemoryError:
+        logger.error("skipped episode %d: the memory of the GPU is full", index)
+        name = f"{work.source.repo_id} episode {index}"
+        return f"{name}: the memory of the GPU is full; try fewer --workers, or a smaller --fit.max_width"
     except Exception as error:  # hours of other episodes' work must not be lost to a fault in one
         logger.exception("skipped episode %d: a fault of lerobot_msdyn, please report it", index)
         return f"{work.source.repo_id} episode {index}: {type(error).__name__}: {error}"

@@ -9,11 +9,12 @@ from pathlib import Path
 from lerobot.datasets import LeRobotDatasetMetadata
 
 from lerobot_msdyn.config import Recipe
+from lerobot_msdyn.devices import chosen_device
 from lerobot_msdyn.episode import View, read_episode
 from lerobot_msdyn.pictures import stage_pictures
 from lerobot_msdyn.pipeline import FURTHER_STEPS, by_feature, reconstruct
 from lerobot_msdyn.sharing import looked_at
-from lerobot_msdyn.views import new_pictures
+from lerobot_msdyn.views import new_pictures, on_device
 
 PROBE_FRAMES = 24
 PROBE_STEPS = 14
@@ -67,7 +68,8 @@ def measure_speeds(source: LeRobotDatasetMetadata, index: int, cameras: list[str
         step_s += statistics.median(steps)
         with tempfile.TemporaryDirectory() as folder:
             start = time.perf_counter()
-            pictures = by_feature(source, {key: new_pictures(scene, part.camera)})
+            drawn = on_device(scene, chosen_device(recipe.device))
+            pictures = by_feature(source, {key: new_pictures(drawn, part.camera)})
             stage_pictures(source, Path(folder), pictures, len(part.rgb))
             render_s += (time.perf_counter() - start) / len(part.rgb)
     return Speeds(read_s, prepare_s, step_s, render_s)

@@ -25,7 +25,7 @@ def missing(alpha: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
 def filled(
     rgb: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"], depth: Float[Tensor, "h w"], fill: Fill
 ) -> Float[Tensor, "h w 3"]:
-    """A picture (0..1, over black) whose holes are filled.
+    """A picture (0..1, over black) whose holes are filled, on the host.
 
     A hole beside an object is what the object hid: it is continued from the farther side, not from the object.
 

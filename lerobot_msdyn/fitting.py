@@ -18,6 +18,7 @@ from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.rendering import Rendering, draw
 from lerobot_msdyn.scene import DynamicScene, Gaussians, with_slope
 from lerobot_msdyn.shading import no_shading
+from lerobot_msdyn.values import to_device
 
 logger = logging.getLogger(__name__)
 
@@ -42,19 +43,19 @@ class FitResult:
 
 @dataclass(frozen=True)
 class _Targets:
-    """What a video's frames should look like."""
+    """What a video's frames should look like, on the device of the scene."""
 
     view: View
-    priors: Priors
+    depth: Float[Tensor, "t h w"]  # m, 0 = unknown
+    moves: Bool[Tensor, "t h w"]
     certain: Bool[Tensor, "t h w"]  # where the mask can be trusted
 
     def terms(self, drawn: Rendering, frames: Int[Tensor, " b"]) -> dict[str, Float[Tensor, ""]]:
         """All loss terms, unweighted, by the names of their weights."""
-        moving = self.priors.instances[frames] > 0
         return {
             "rgb": rgb_loss(drawn.rgb, self.view.rgb[frames].float() / 255),
-            "depth": depth_loss(drawn.depth, self.priors.depth[frames], drawn.alpha),
-            "mask": mask_loss(drawn.moving, moving, self.certain[frames]),
+            "depth": depth_loss(drawn.depth, self.depth[frames], drawn.alpha),
+            "mask": mask_loss(drawn.moving, self.moves[frames], self.certain[frames]),
         }
 
 
@@ -70,12 +71,12 @@ def fit(
     backend: str = "auto",
     progress: Callable[[int], object] = lambda steps: None,
 ) -> FitResult:
-    """Fit a scene to one camera's video; motion stays as it was initialised.
+    """Fit a scene to one camera's video, on the device that holds the scene; motion stays as it was initialised.
 
     Args:
         scene: where to start from; it is not changed.
-        view: the video, at the size at which it is fitted.
-        priors: its priors, at the same size.
+        view: the video, at the size at which it is fitted; on the host.
+        priors: its priors, at the same size; on the host.
         config: steps, weights and learning rates.
         empty: what the camera sees where nothing moves, by which brightness is measured.
         distance: distance to the look-at point (m), the unit of the means' learning rate.
@@ -88,20 +89,22 @@ def fit(
     """
     start = time.perf_counter()
     if config.shadows:
-        scene = replace(scene, shading=static_shading(scene.static, len(scene.moving), view, priors, empty))
+        shading = static_shading(to_device(scene.static, "cpu"), len(scene.moving), view, priors, empty)
+        scene = replace(scene, shading=to_device(shading, scene.device))
     if config.sh_degree > 0:
         scene = replace(scene, moving=with_slope(scene.moving))
     scene, optimizer = _trainable(scene, config.learning_rates, distance)
     decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, FINAL_RATE ** (1 / max(config.steps, 1)))
-    targets = _Targets(view, priors, certain_pixels(priors.instances > 0, MASK_BAND_PX))
+    moves = priors.instances > 0
+    targets = to_device(_Targets(view, priors.depth, moves, certain_pixels(moves, MASK_BAND_PX)), scene.device)
     order, held_out = _frames(len(view.rgb), config.held_out_frames, seed)
-    enough = _Enough(view, held_out, config.patience, backend)
+    enough = _Enough(targets.view, held_out, config.patience, backend)
     history: list[dict[str, Tensor]] = []
     for step in range(config.steps):
         if step == int(config.moving_gain_from * config.steps) and len(scene.moving) > 0:
             scene = _with_moving_gain(scene, view, priors, backend)
-        frames = next(order)
-        terms = targets.terms(draw(scene, view.camera.select(frames), frames, backend), frames)
+        frames = next(order).to(scene.device)
+        terms = targets.terms(draw(scene, targets.view.camera.select(frames), frames, backend), frames)
         loss = torch.stack([getattr(config.weights, name) * term for name, term in terms.items()]).sum()
         _check(loss, step, frames)
         optimizer.zero_grad(set_to_none=True)
@@ -114,12 +117,13 @@ def fit(
             break
     if len(history) < config.steps:
         progress(config.steps - len(history))
-    return _result(_detached(scene), history, view, held_out, backend, time.perf_counter() - start)
+    return _result(_detached(scene), history, targets.view, held_out, backend, time.perf_counter() - start)
 
 
 @torch.no_grad()
 def psnr(scene: DynamicScene, view: View, frames: Int[Tensor, " b"], backend: str = "auto") -> float:
-    """Peak signal-to-noise ratio (dB) of the drawn against the recorded pictures."""
+    """Peak signal-to-noise ratio (dB) of the drawn against the recorded pictures, which are on one device."""
+    frames = frames.to(view.rgb.device)
     drawn = draw(scene, view.camera.select(frames), frames, backend).rgb.clamp(0, 1)
     error = (drawn - view.rgb[frames].float() / 255).square().mean()
     return float(-10 * torch.log10(error.clamp(min=1e-10)))
@@ -168,8 +172,9 @@ def _check(loss: Float[Tensor, ""], step: int, frames: Int[Tensor, "1"]) -> None
 
 
 def _with_moving_gain(scene: DynamicScene, view: View, priors: Priors, backend: str) -> DynamicScene:
-    shading = scene.shading or no_shading(len(scene.static), len(scene.moving), scene.frames)
-    return replace(scene, shading=replace(shading, moving=moving_gain(scene, view, priors, backend)))
+    shading = scene.shading or to_device(no_shading(len(scene.static), len(scene.moving), scene.frames), scene.device)
+    gain = moving_gain(scene, view, priors, backend).to(scene.device)
+    return replace(scene, shading=replace(shading, moving=gain))
 
 
 def _result(

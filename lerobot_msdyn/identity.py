@@ -14,6 +14,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 
 from lerobot_msdyn.checks import place_problem
 from lerobot_msdyn.config import AugmentConfig, Recipe
+from lerobot_msdyn.devices import chosen_device
 from lerobot_msdyn.files import DIGEST_BYTES, digest_of_file
 
 LIBRARIES = ("lerobot_msdyn", "lerobot", "torch", "numpy", "opencv-python-headless", "av", "numba", "pyarrow")
@@ -21,17 +22,21 @@ PLACES = ("root", "new_root", "dry_run", "restart", "workers")  # settings that 
 
 
 def describe_run(root: Path, files: Iterable[Path], config: AugmentConfig) -> dict[str, Any]:
-    """Settings, digests of all files that are read, and versions, as JSON.
+    """Settings, digests of all files that are read, the device and versions, as JSON.
 
     Args:
         root: the folder of the source.
         files: those of its files that are read.
         config: the settings.
+
+    Raises:
+        ConfigError: they demand a device that cannot be used.
     """
     settings = {key: value for key, value in draccus.encode(config).items() if key not in PLACES}
     settings["priors"].pop("cache")
     return {
         "recipe": settings,
+        "device": chosen_device(config.device).type,
         "source": {str(path.relative_to(root)): digest_of_file(path) for path in files},
         "files": {str(path): digest_of_file(path) for path in _named_files(settings)},
         "versions": versions() | {"code": code_digest()},

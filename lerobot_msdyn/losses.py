@@ -17,10 +17,9 @@ def depth_loss(
 ) -> Float[Tensor, ""]:
     """Mean absolute difference of inverse depth over its mean, where depth (m, 0 = unknown) is known and drawn."""
     valid = (known > 0) & (alpha > 0.5) & (drawn > 0)
-    if not bool(valid.any()):
-        return drawn.sum() * 0
-    target = 1 / known[valid]
-    return (1 / drawn[valid] - target).abs().mean() / target.mean()
+    target = torch.where(valid, known, 1.0).reciprocal() * valid
+    found = torch.where(valid, drawn, 1.0).reciprocal() * valid
+    return (found - target).abs().sum() / target.sum().clamp(min=1e-12)
 
 
 def mask_loss(

@@ -1,6 +1,7 @@
 """Gaussians of single frames: what the recorded camera shows at a time and the motion of the scene does not explain."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -35,15 +36,21 @@ class Overlay:
 
     def patch(self, frame: int, gaussians: int) -> FramePatch:
         """The patch of a frame of a scene with so many Gaussians of its own."""
-        rows = slice(int(self.first[frame]), int(self.first[frame + 1]))
-        bits = np.unpackbits(self.hidden[frame].numpy(), count=gaussians)
+        rows = slice(self._first[frame], self._first[frame + 1])
+        places = torch.arange(7, -1, -1, dtype=torch.uint8, device=self.hidden.device)
+        bits = (self.hidden[frame][:, None] >> places) & 1
         return FramePatch(
             self.means[rows],
             self.quats[rows].float(),
             self.log_scales[rows].float(),
             self.rgb[rows].float(),
-            torch.from_numpy(bits).bool(),
+            bits.bool().flatten()[:gaussians],
         )
+
+    @cached_property
+    def _first(self) -> list[int]:
+        """`first` for indexing, asked of its device once."""
+        return [int(row) for row in self.first.tolist()]
 
 
 def packed(patches: list[FramePatch]) -> Overlay:

@@ -1,7 +1,9 @@
 """The pictures of one new episode, encoded as they are drawn, all cameras in step, and read again before they count."""
 
 import shutil
-from collections.abc import Iterable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,11 +15,12 @@ from lerobot.datasets.compute_stats import auto_downsample_height_width, get_fea
 from lerobot_msdyn.episode import depth_units_per_metre, encode_image, picture_channels
 from lerobot_msdyn.errors import OutputError
 from lerobot_msdyn.files import writing
-from lerobot_msdyn.video import VideoFile, encoder_of, problem_of
+from lerobot_msdyn.video import VideoFile, encoder_of, nvenc_of, problem_of
 
 Stats = dict[str, dict[str, np.ndarray]]
 
 OPAQUE = 255
+AHEAD = 16  # times that may be drawn before they are encoded; it bounds the memory
 
 
 @dataclass(frozen=True)
@@ -30,30 +33,39 @@ class StagedPictures:
 
 
 def stage_pictures(
-    source: LeRobotDatasetMetadata, folder: Path, frames: Iterable[Mapping[str, np.ndarray]], length: int
+    source: LeRobotDatasetMetadata,
+    folder: Path,
+    frames: Iterable[Mapping[str, np.ndarray]],
+    length: int,
+    *,
+    nvenc: bool = False,
 ) -> StagedPictures:
     """Encode the frames of an episode as their features are encoded in the source, and decode them again.
+
+    Frames are encoded in a thread, while the next ones are drawn.
 
     Args:
         source: the dataset whose features they are.
         folder: where to put them; what lies there is removed.
         frames: per time, feature -> colours uint8 [h,w,3], or depth float32 [h,w] in m (0 = unknown).
         length: how many frames there must be.
+        nvenc: whether a GPU encodes videos where it can (see `nvenc_of`).
 
     Raises:
         OutputError: there are more or fewer, the source's video codec cannot be written here, or the disk is full.
     """
     writers: dict[str, _FeatureWriter] = {}
-    count = 0
+
+    def encode(pictures: Mapping[str, np.ndarray]) -> None:
+        for key, picture in pictures.items():
+            if key not in writers:
+                writers[key] = _FeatureWriter(source, key, folder, length, nvenc=nvenc)
+            writers[key].add(picture)
+
     with writing(folder):
         shutil.rmtree(folder, ignore_errors=True)
         try:
-            for pictures in frames:
-                for key, picture in pictures.items():
-                    if key not in writers:
-                        writers[key] = _FeatureWriter(source, key, folder, length)
-                    writers[key].add(picture)
-                count += 1
+            count = _meanwhile(encode, frames)
         finally:
             for writer in writers.values():
                 writer.close()
@@ -68,10 +80,24 @@ def stage_pictures(
     )
 
 
+def _meanwhile[T](work: Callable[[T], None], items: Iterable[T]) -> int:
+    """Do the work on each item, in order, in a thread, while the next items are made; returns how many there were."""
+    count, waiting = 0, deque[Future[None]]()
+    with ThreadPoolExecutor(1, "encoder") as thread:
+        for item in items:
+            waiting.append(thread.submit(work, item))
+            count += 1
+            if len(waiting) > AHEAD:
+                waiting.popleft().result()
+        for future in waiting:
+            future.result()
+    return count
+
+
 class _FeatureWriter:
     """One feature's pictures: an mp4 file, or a folder of image files; and the samples for their statistics."""
 
-    def __init__(self, source: LeRobotDatasetMetadata, key: str, folder: Path, length: int) -> None:
+    def __init__(self, source: LeRobotDatasetMetadata, key: str, folder: Path, length: int, *, nvenc: bool) -> None:
         self._unit = depth_units_per_metre(source, key)
         self._is_depth = key in source.depth_keys
         self._channels = picture_channels(source, key)
@@ -84,7 +110,8 @@ class _FeatureWriter:
         self._video: VideoFile | None = None
         if key in source.video_keys:
             self.path = folder / f"{key}.mp4"
-            self._video = VideoFile(self.path, source.fps, encoder_of(source.features[key], key))
+            encoder = encoder_of(source.features[key], key)
+            self._video = VideoFile(self.path, source.fps, nvenc_of(encoder) if nvenc else encoder)
         else:
             self.path = folder / key
             self.path.mkdir(parents=True)

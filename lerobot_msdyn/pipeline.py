@@ -17,6 +17,7 @@ from lerobot_msdyn.bounds import NewCameras, new_cameras
 from lerobot_msdyn.cameras import concatenated, read_calibration
 from lerobot_msdyn.config import OtherCameraConfig, Recipe, SceneConfig
 from lerobot_msdyn.coverage import Evidence, evidence_of
+from lerobot_msdyn.devices import chosen_device
 from lerobot_msdyn.episode import View, depth_key_of, read_episode, shrink
 from lerobot_msdyn.errors import ConfigError
 from lerobot_msdyn.fitting import FitResult, fit
@@ -37,7 +38,8 @@ from lerobot_msdyn.shared import (
 from lerobot_msdyn.sharing import NEAR, Backgrounds, moving_in_few, share, windows
 from lerobot_msdyn.staging import SCENE
 from lerobot_msdyn.unexplained import unexplained
-from lerobot_msdyn.views import Picture, Reconstruction, UnseenMasks, new_pictures
+from lerobot_msdyn.values import to_device
+from lerobot_msdyn.views import Picture, Reconstruction, UnseenMasks, new_pictures, on_device
 from lerobot_msdyn.write import NewEpisode, OutputDataset
 
 logger = logging.getLogger(__name__)
@@ -83,6 +85,7 @@ def augment_episode(
             key=key,
         )
         scenes[key] = kept.keep(f"{SCENE}_{key}", make_scene)
+    drawn = {key: on_device(scene, chosen_device(recipe.device)) for key, scene in scenes.items()}
     priors = {key: scene.provenance for key, scene in scenes.items()}
     other = _other_pose(recipe, index, episode.views[cameras[0]])
     new = []
@@ -90,7 +93,7 @@ def augment_episode(
         new.append(NewEpisode(index, Provenance(source.repo_id, index, SOURCE_VARIANT, recipe.seed, {}, priors)))
     for variant in range(recipe.variants):
         progress(f"episode {index}: rendering variant {variant}", 0.0)
-        make_episode = functools.partial(_rendered, source, index, variant, recipe, output, scenes, other)
+        make_episode = functools.partial(_rendered, source, index, variant, recipe, output, drawn, other)
         new.append(kept.keep(f"variant_{variant:02d}", make_episode))
         progress("", 0.5 / recipe.variants)
     if recipe.save_scenes:
@@ -209,7 +212,10 @@ def reconstruct(
 
     Long videos are cut into windows, each with priors and a scene of its own, so that memory beyond the video itself
     is that of one window. Windows share a background as episodes do. The last arguments are those of
-    `estimate_priors`.
+    `estimate_priors`. The fit runs on the recipe's device; the result is on the host.
+
+    Raises:
+        ConfigError: the recipe demands a device that cannot be used.
     """
     parts = windows(view, recipe)
     if len(parts) > 1 and not backgrounds and recipe.scene.shared_background:
@@ -252,6 +258,7 @@ def _fit_window(
     priors_of: Callable[..., Priors],
 ) -> tuple[FitResult, Priors, float, Evidence, Witness]:
     """A fitted scene of one window, its priors, look-at distance (m), what was recorded, and how well that is met."""
+    device = chosen_device(recipe.device)
     steps, settings = recipe.fit.steps, recipe.scene
     recorded_width, view = view.rgb.shape[2], shrink(view, recipe.fit.max_width)
     enlarged = recorded_width > view.rgb.shape[2]
@@ -274,7 +281,7 @@ def _fit_window(
             scene = replace(scene, static=adapted(shared, empty, scene.static))
             steps = round(FURTHER_STEPS * steps)
         result = fit(
-            scene,
+            to_device(scene, device),
             view,
             priors,
             replace(recipe.fit, steps=steps),
@@ -288,6 +295,7 @@ def _fit_window(
         if settings.overlay:
             overlay = unexplained(result.scene, view, priors, enlarged=enlarged)
             result = replace(result, scene=replace(result.scene, overlay=overlay))
+        result, seen = to_device((result, seen), "cpu")
     return result, priors, distance, seen, said
 
 

@@ -12,6 +12,7 @@ from lerobot_msdyn.overlay import FramePatch
 from lerobot_msdyn.render import Raster, rasterize
 from lerobot_msdyn.render.threads import torch_on_one_thread
 from lerobot_msdyn.scene import DynamicScene, Snapshot, patched
+from lerobot_msdyn.values import to_device
 
 
 @dataclass(frozen=True)
@@ -34,9 +35,11 @@ def draw(
 ) -> Rendering:
     """The scene at `frames` (int, [b]) through the b poses of `camera`; differentiable.
 
-    `extra` is a value per moving Gaussian to be drawn as well; overlays have one of 1.
+    `extra` is a value per moving Gaussian to be drawn as well; overlays have one of 1. It is drawn on the scene's
+    device; frames and camera may be on the host.
     """
     if scene.overlay is None:
+        camera, frames = to_device((camera, frames), scene.device)
         return _rasterized(_snapshot(scene, camera, frames, extra), camera, scene.near, backend)
     own = len(scene.static) + len(scene.moving)
     drawn = [
@@ -56,15 +59,15 @@ def draw_patched(
     extra: Float[Tensor, " m"] | None = None,
 ) -> Rendering:
     """The scene at one frame through one pose, with a patch in place of what the patch hides."""
-    snapshot = _snapshot(scene, camera, torch.tensor([frame]), extra)
-    return _rasterized(patched(snapshot, patch), camera, scene.near, backend)
+    camera, when, patch = to_device((camera, torch.tensor([frame]), patch), scene.device)
+    return _rasterized(patched(_snapshot(scene, camera, when, extra), patch), camera, scene.near, backend)
 
 
 def _snapshot(scene: DynamicScene, camera: CameraTrack, frames: Tensor, extra: Float[Tensor, " m"] | None) -> Snapshot:
     snapshot = scene.at(frames, camera.world_from_camera[:, :3, 3])
     if extra is None:
         return snapshot
-    return replace(snapshot, extra=torch.cat((torch.zeros(len(scene.static)), extra)))
+    return replace(snapshot, extra=torch.cat((extra.new_zeros(len(scene.static)), extra)))
 
 
 def _rasterized(snapshot: Snapshot, camera: CameraTrack, near: float, backend: str) -> Rendering:

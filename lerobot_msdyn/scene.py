@@ -110,7 +110,7 @@ class Snapshot:
 
 def patched(snapshot: Snapshot, patch: FramePatch) -> Snapshot:
     """A snapshot of one frame, with a patch in place of what the patch hides; the patch counts as moving."""
-    kept, ones = ~patch.hidden, torch.ones(len(patch))
+    kept, ones = (~patch.hidden).nonzero()[:, 0], patch.means.new_ones(len(patch))
     return Snapshot(
         means=torch.cat((snapshot.means[:, kept], patch.means[None]), dim=1),
         quats=torch.cat((snapshot.quats[:, kept], patch.quats[None]), dim=1),
@@ -136,6 +136,11 @@ class DynamicScene:
     near: float = 0.01  # m; nothing that is as near to a camera is drawn
     overlay: Overlay | None = None  # none: nothing is shown as it was recorded
 
+    @property
+    def device(self) -> torch.device:
+        """Where its tensors are."""
+        return self.static.means.device
+
     def still(self) -> "DynamicScene":
         """The same without what moves and without an overlay: the static set, its brightness and the near plane."""
         shading = None if self.shading is None else replace(self.shading, moving=self.shading.moving[:, :0])
@@ -149,7 +154,7 @@ class DynamicScene:
             frames: the frames.
             eye: from where it is seen at each (m), for colours that depend on it; without, their means are given.
         """
-        static, moving = self.static, self.moving
+        static, moving, frames = self.static, self.moving, frames.to(self.device)
         means, quats = compose(moving.means, moving.quats, self.levels, self.indices, self.logits, frames)
         b = len(frames)
         return Snapshot(
@@ -186,7 +191,7 @@ class DynamicScene:
         static = self.static.rgb.expand(len(frames), -1, -1)
         moving = self.moving.rgb.expand(len(frames), -1, -1)
         if eye is not None and self.moving.sh.shape[1] > 1:
-            back = quaternion_multiply(self.moving.quats, quats * torch.tensor([1.0, -1.0, -1.0, -1.0]))
+            back = quaternion_multiply(self.moving.quats, quats * quats.new_tensor([1.0, -1.0, -1.0, -1.0]))
             sight = torch.nn.functional.normalize(means - eye[:, None], dim=-1)
             moving = shaded(self.moving.sh, (quaternion_to_matrix(back) @ sight[..., None])[..., 0])
         if self.shading is not None:

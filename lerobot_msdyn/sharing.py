@@ -17,6 +17,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.config import Recipe
+from lerobot_msdyn.devices import chosen_device
 from lerobot_msdyn.episode import View, read_episode, shrink
 from lerobot_msdyn.errors import EpisodeError, PriorError
 from lerobot_msdyn.fitting import fit
@@ -36,6 +37,7 @@ from lerobot_msdyn.shared import (
     pooled,
     same_places,
 )
+from lerobot_msdyn.values import to_device
 
 logger = logging.getLogger(__name__)
 
@@ -172,11 +174,12 @@ def _fitted(background: SharedBackground, recipe: Recipe) -> SharedBackground:
     try:
         distance = look_at_distance(empty.depth)
         scene = replace(scene, near=NEAR * distance)
+        scene = to_device(scene, chosen_device(recipe.device))
         result = fit(scene, view, priors, config, empty=empty.rgb, distance=distance, seed=recipe.seed)
     except EpisodeError as error:
         logger.warning("shared background: %s; every episode fits its own", error)
         return background
-    return replace(background, static=result.scene.static)
+    return replace(background, static=to_device(result.scene.static, "cpu"))
 
 
 def _no_tracks() -> PointTracks:

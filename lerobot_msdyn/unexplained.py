@@ -18,6 +18,7 @@ from lerobot_msdyn.overlay import FramePatch, Overlay, packed
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.rendering import Rendering, draw, draw_patched
 from lerobot_msdyn.scene import DynamicScene
+from lerobot_msdyn.values import to_device
 
 logger = logging.getLogger(__name__)
 
@@ -43,7 +44,7 @@ def unexplained(
     contradicts the scene beyond what its provider may err by, and not at all where it is assumed.
 
     Args:
-        scene: fitted, without an overlay.
+        scene: fitted, without an overlay; on any device, the result is on the host.
         view: the video, at the size at which it was fitted.
         priors: its depth.
         backend: of the rasterizer.
@@ -55,8 +56,8 @@ def unexplained(
         camera, when = view.camera.select([frame]), torch.tensor([frame])
         depth = fill_depth(priors.depth[frame])
         if still is None or not view.camera.is_static:
-            still = draw(scene.still(), camera, when, backend).depth[0]
-        drawn = draw(scene, camera, when, backend)
+            still = draw(scene.still(), camera, when, backend).depth[0].cpu()
+        drawn = to_device(draw(scene, camera, when, backend), "cpu")
         wrong = _wrong(drawn, view.rgb[frame].float() / 255, depth.numpy(), tolerance)
         taken = wrong & ~_behind_an_edge(depth.numpy(), still.numpy())
         patches.append(_patch(scene, view, depth, frame, wrong, taken, scale, backend))
@@ -127,7 +128,7 @@ def _patch(
     first = FramePatch(pixels.means, pixels.quats, log_scales, recorded, hidden)
     if len(first) == 0:
         return first
-    drawn = draw_patched(scene, camera, frame, first, backend).rgb[0].reshape(-1, 3)[chosen]
+    drawn = draw_patched(scene, camera, frame, first, backend).rgb[0].cpu().reshape(-1, 3)[chosen]
     return FramePatch(pixels.means, pixels.quats, log_scales, (2 * recorded - drawn).clamp(0, 1.5), hidden)
 
 
@@ -140,7 +141,7 @@ def _hidden(
     taken: Bool[Tensor, "h w"],
 ) -> Bool[Tensor, " g"]:
     """Gaussians on or before the recorded surface: moving ones where it is wrong, static ones where it is replaced."""
-    snapshot = scene.at(when)
+    snapshot = to_device(scene.at(when), "cpu")
     xy, z = project(transform_points(camera.camera_from_world, snapshot.means)[0], camera.intrinsics[0])
     column, row = xy.floor().long().unbind(-1)
     inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height) & (z > 0)

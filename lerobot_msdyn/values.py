@@ -1,4 +1,4 @@
-"""Plain values (nested dataclasses of tensors) to and from one file each.
+"""Plain values (nested dataclasses of tensors) to and from one file each, and from one device to another.
 
 The file is safetensors: arrays as such, everything else as JSON in its header. Floats and arrays come back bit for bit.
 Only dataclasses of this package are made from a file, by their fields; nothing in it is executed.
@@ -52,6 +52,21 @@ def load_value(path: Path, base: Path) -> Any:
         return _decoded(header, arrays, base)
     except (OSError, SafetensorError, ValueError, KeyError, TypeError, AttributeError, ImportError) as error:
         raise ValueFileError(f"{path} cannot be read ({type(error).__name__}: {error})") from error
+
+
+def to_device[T](value: T, device: torch.device | str) -> T:
+    """The same value with its tensors on a device; one of tensors, dataclasses, lists, tuples and dictionaries."""
+    moved: Any = value
+    if isinstance(value, Tensor):
+        moved = value.to(device)
+    elif isinstance(value, list | tuple):
+        moved = type(value)(to_device(item, device) for item in value)
+    elif isinstance(value, dict):
+        moved = {key: to_device(item, device) for key, item in value.items()}
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        names = [item.name for item in dataclasses.fields(value)]
+        moved = dataclasses.replace(value, **{name: to_device(getattr(value, name), device) for name in names})
+    return moved
 
 
 def _encoded(value: object, arrays: dict[str, Tensor], base: Path) -> Any:

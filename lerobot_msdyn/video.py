@@ -1,9 +1,12 @@
 """Video files: encode frames as the source was encoded, and cut an episode out of a shared file without loss."""
 
+import logging
 import os
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from fractions import Fraction
+from functools import cache
 from pathlib import Path
 
 import av
@@ -18,6 +21,9 @@ from lerobot_msdyn.errors import EpisodeError, OutputError
 from lerobot_msdyn.files import DISK_FAULTS
 from lerobot_msdyn.rows import TIMESTAMP_TOLERANCE_S
 
+logger = logging.getLogger(__name__)
+
+NVENC = {"h264": "h264_nvenc", "hevc": "hevc_nvenc"}  # LeRobot's encoders: on the processor, and on an NVIDIA GPU
 MAX_LEVEL_ERROR = 16  # of 255; coding changes a frame's mean brightness by less than 2, an empty frame by more
 
 
@@ -44,6 +50,31 @@ def encoder_of(feature: dict, key: str) -> RGBEncoderConfig | DepthEncoderConfig
         return kind.from_video_info(info)
     except (ValueError, TypeError) as error:
         raise OutputError(f"{key}: cannot encode video as its source ({error})") from error
+
+
+def nvenc_of(encoder: RGBEncoderConfig | DepthEncoderConfig) -> RGBEncoderConfig | DepthEncoderConfig:
+    """The settings for NVENC, where LeRobot has them for the codec and the GPU can encode; else the given ones.
+
+    The codec stays what it was; LeRobot passes the quality on as NVENC's constant quantiser. Depth is never given to
+    it: NVENC has no format of one channel and 12 bits.
+    """
+    name = NVENC.get(encoder.vcodec)
+    if name is None or isinstance(encoder, DepthEncoderConfig) or not _can_encode(name):
+        return encoder
+    return replace(encoder, vcodec=name, preset=None)
+
+
+@cache
+def _can_encode(name: str) -> bool:
+    """Whether an encoder can be opened: FFmpeg lists those of GPUs on every machine."""
+    try:
+        codec = av.CodecContext.create(name, "w")
+        codec.width, codec.height, codec.pix_fmt, codec.time_base = 256, 256, "yuv420p", Fraction(1, 30)
+        codec.open()
+    except (av.FFmpegError, ValueError) as error:
+        logger.warning("%s cannot be used here (%s): videos are encoded on the processor", name, error)
+        return False
+    return True
 
 
 class VideoFile:

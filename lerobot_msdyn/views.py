@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from lerobot_msdyn.quality.verdict import Witnessed
 from lerobot_msdyn.quality.witness import Witness
 from lerobot_msdyn.rendering import Rendering, render_frames
 from lerobot_msdyn.scene import DynamicScene
+from lerobot_msdyn.values import to_device
 
 logger = logging.getLogger(__name__)
 
@@ -72,13 +73,19 @@ def new_pictures(
     shares: list[float] = []
     for rendering, found, behind in _drawn(scene, camera, frames, fill):
         drawn = (rendering.rgb + missing(rendering.alpha)[..., None] * behind).clamp(0, 1)
-        drawn = (drawn * 255).round().to(torch.uint8)
+        drawn, depths = to_device(((drawn * 255).round().to(torch.uint8), rendering.depth), "cpu")
         for i, coverage in enumerate(found):
             shares.append(coverage.unseen_share)
             known = ~coverage.empty & scene.metric
-            depth = np.where(known, rendering.depth[i].numpy(), np.float32(0))
+            depth = np.where(known, depths[i].numpy(), np.float32(0))
             yield Picture(drawn[i].numpy(), depth, coverage.unseen)
     logger.info("%.1f %% of the pixels were never seen (worst frame %.1f %%)", 100 * np.mean(shares), 100 * max(shares))
+
+
+def on_device(scene: Reconstruction, device: torch.device) -> Reconstruction:
+    """The same with what is drawn, and what it is compared with pixel by pixel, on a device."""
+    results, evidence = to_device((scene.results, scene.evidence), device)
+    return replace(scene, results=results, evidence=evidence)
 
 
 class UnseenMasks:
@@ -115,7 +122,7 @@ def _drawn(
             batch = slice(done, done + len(rendering.alpha))
             done = batch.stop
             if fill == "none":
-                behind = torch.zeros(1, 1, 1, 3)
+                behind = rendering.rgb.new_zeros(1, 1, 1, 3)
             elif once is None:
                 behind = torch.stack([_filled(rendering, i, fill) for i in range(len(rendering.alpha))])
             else:
@@ -124,7 +131,8 @@ def _drawn(
 
 
 def _filled(rendering: Rendering, i: int, fill: Fill) -> Float[Tensor, "h w 3"]:
-    return filled(rendering.rgb[i], rendering.alpha[i], rendering.depth[i], fill)
+    picture = to_device((rendering.rgb[i], rendering.alpha[i], rendering.depth[i]), "cpu")
+    return filled(*picture, fill).to(rendering.rgb.device)
 
 
 def _still_filled(scene: DynamicScene, camera: CameraTrack, times: Tensor, fill: Fill) -> Float[Tensor, "1 h w 3"]:

@@ -8,6 +8,7 @@ import contextlib
 import functools
 import logging
 import logging.handlers
+import math
 import multiprocessing
 import os
 import signal
@@ -27,6 +28,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from tqdm import tqdm
 
 from lerobot_msdyn.config import AugmentConfig
+from lerobot_msdyn.devices import chosen_device
 from lerobot_msdyn.episode import open_source
 from lerobot_msdyn.errors import WorkerError
 from lerobot_msdyn.pipeline import Progress
@@ -36,6 +38,7 @@ from lerobot_msdyn.video import quiet_encoders
 from lerobot_msdyn.write import OutputDataset
 
 MEMORY_EACH = 3e9  # bytes of a machine's memory that there must be for each worker
+GPU_MEMORY_EACH = 4e9  # bytes of a GPU's free memory; by arithmetic, not measured (docs/gpu.md)
 FRAMES_EACH = 200  # of work, for which starting a worker pays
 
 
@@ -75,7 +78,8 @@ class _Place:
 
 def workers_for(config: AugmentConfig, frames: int, episodes: int) -> int:
     """How many processes are worth while for so many frames of so many episodes."""
-    wanted = config.workers or min(_cores(), int(_memory() // MEMORY_EACH), frames // FRAMES_EACH)
+    room = min(_memory() // MEMORY_EACH, _room_on_gpu(config))
+    wanted = config.workers or int(min(_cores(), room, frames // FRAMES_EACH))
     return max(1, min(wanted, episodes))
 
 
@@ -101,6 +105,13 @@ def _cores() -> int:
 def _memory() -> int:
     """Bytes of the machine's memory."""
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 0
+
+
+def _room_on_gpu(config: AugmentConfig) -> float:
+    """How many workers a GPU has memory for, where they draw on one."""
+    if chosen_device(config.device).type == "cpu":
+        return math.inf
+    return torch.cuda.mem_get_info()[0] // GPU_MEMORY_EACH
 
 
 class Workers:
@@ -175,12 +186,14 @@ def _begin(place: _Place, threads: int, parent: Connection, said: Queue) -> None
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     logging.basicConfig(level=logging.INFO, handlers=[logging.handlers.QueueHandler(said)], force=True)
+    logging.getLogger(chosen_device.__module__).setLevel(logging.ERROR)  # its parent has said what is used
     tqdm.set_lock(threading.RLock())  # its own is for several processes, and left behind by one that ends at once
     torch.set_num_threads(threads)
     cv2.setNumThreads(threads)
     quiet_encoders()
     source = open_source(place.repo_id, place.root)
-    output = OutputDataset(source, place.new_repo_id, place.new_root, Staging(place.new_root, lock=False))
+    staging = Staging(place.new_root, lock=False)
+    output = OutputDataset(source, place.new_repo_id, place.new_root, staging, nvenc=place.config.nvenc)
     _here.append(Work(source, place.cameras, place.config, output, lambda what, share: said.put((what, share))))
 
 

@@ -52,7 +52,13 @@ class OutputDataset:
     """A dataset in the making. Use as a context; what is finished is kept for the next run, until the dataset is."""
 
     def __init__(
-        self, source: LeRobotDatasetMetadata, repo_id: str, root: Path, staging: Staging | None = None
+        self,
+        source: LeRobotDatasetMetadata,
+        repo_id: str,
+        root: Path,
+        staging: Staging | None = None,
+        *,
+        nvenc: bool = False,
     ) -> None:
         """Prepare the work folder.
 
@@ -61,12 +67,13 @@ class OutputDataset:
             repo_id: the new dataset's name.
             root: its place.
             staging: a work folder that may hold what an earlier run finished; default: an empty one.
+            nvenc: whether a GPU encodes the new videos where it can.
 
         Raises:
             OutputError: the place is taken, lies inside the source, is being written by another run, or cannot be.
         """
         check_place(source.root, root)
-        self.source, self.repo_id, self.root = source, repo_id, root
+        self.source, self.repo_id, self.root, self.nvenc = source, repo_id, root, nvenc
         self._resumable = staging is not None
         self.staging = staging or Staging(root)
         if staging is None:
@@ -90,7 +97,8 @@ class OutputDataset:
     ) -> NewEpisode:
         """Encode the new pictures of one episode as they are drawn (see `stage_pictures`)."""
         folder = self.episode(index).folder / f"variant_{variant:02d}"
-        pictures = stage_pictures(self.source, folder, frames, int(self.source.episodes[index]["length"]))
+        length = int(self.source.episodes[index]["length"])
+        pictures = stage_pictures(self.source, folder, frames, length, nvenc=self.nvenc)
         return NewEpisode(index, provenance, pictures)
 
     def is_finished(self, index: int) -> bool:

@@ -116,3 +116,19 @@ def test_corruptions_are_what_they_are_called(monkeypatch: pytest.MonkeyPatch, t
         assert case.recipe.priors.depth == ("auto" if name != "wrong_depth" else case.recipe.priors.masks)
         assert (case.recipe.fit.steps == 1) == (name == "too_few_steps")
     assert recipe == Recipe()
+
+
+def test_the_gpu_benchmark_runs_on_the_cpu(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    gpu = importlib.import_module("gpu")
+    sizes = ["--workloads", "W3", "--parity", "W3", "--frames", "24", "--width", "96", "--height", "72"]
+    small = ["--device", "cpu", "--recipe", "quick", "--steps", "6", "--episodes", "2"]
+    gpu.main([*small, *sizes, "--json", str(tmp_path / "gpu.json")])
+    rows = json.loads((tmp_path / "gpu.json").read_text())
+    assert {row["part"] for row in rows} == set(gpu.PARTS)
+    assert all(row["pixels off"] < 1e-3 for row in rows if row["part"] == "parity")
+    said = capsys.readouterr().out
+    assert "augment ended with" not in said
+    assert "frames per s, drawn alone" in said

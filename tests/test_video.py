@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from lerobot.configs import RGBEncoderConfig
+from lerobot.configs import DepthEncoderConfig, RGBEncoderConfig
 from lerobot.datasets.video_utils import concatenate_video_files, decode_video_frames
 
+from lerobot_msdyn import video
 from lerobot_msdyn.errors import EpisodeError, OutputError
-from lerobot_msdyn.video import VideoFile, cut_video, encoder_of, frame_times
+from lerobot_msdyn.video import VideoFile, cut_video, encoder_of, frame_times, nvenc_of
 
 FPS = 10
 
@@ -80,3 +81,25 @@ def test_encoder_is_the_sources() -> None:
     assert encoder_of({}, "front").vcodec == "libsvtav1"
     with pytest.raises(OutputError, match="front: cannot encode video as its source"):
         encoder_of({"info": {"video.codec": "vp9"}}, "front")
+
+
+def test_a_gpu_encodes_what_lerobot_has_settings_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(video, "_can_encode", lambda name: True)
+    given = RGBEncoderConfig(vcodec="h264", crf=18, g=5, preset="slow")
+    found = nvenc_of(given)
+    assert (found.vcodec, found.pix_fmt, found.g) == ("h264_nvenc", given.pix_fmt, 5)
+    assert found.get_codec_options()["qp"] == 18
+    for other in (RGBEncoderConfig(vcodec="libsvtav1"), DepthEncoderConfig()):
+        assert nvenc_of(other) is other
+    monkeypatch.setattr(video, "_can_encode", lambda name: False)
+    assert nvenc_of(given) is given
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_without_a_gpu_nvenc_is_not_used(caplog: pytest.LogCaptureFixture) -> None:
+    video._can_encode.cache_clear()
+    given = RGBEncoderConfig(vcodec="h264")
+    with caplog.at_level("WARNING"):
+        assert nvenc_of(given) is given
+        assert nvenc_of(given) is given
+    assert [record.getMessage()[:30] for record in caplog.records] == ["h264_nvenc cannot be used here"]

@@ -74,7 +74,9 @@ def read_video(
         known[t] = (cv2.erode((z > 0).astype(np.uint8), window) > 0) & ~near_depth_edge(z)
         grey[t] = cv2.GaussianBlur(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (0, 0), 1.0)
         distance = cv2.distanceTransform((labels == 0).astype(np.uint8), cv2.DIST_L2, 5)
-        outside[t] = np.minimum(distance * OUTSIDE_UNIT, 255)
+        outside[t] = (
+            np.minimum(distance, 255 / OUTSIDE_UNIT) * OUTSIDE_UNIT
+        )  # without any label the distance is infinite
     maps = Maps(depth.numpy(), known, grey, outside, camera.intrinsics.float().contiguous().numpy(), pixel_m)
     return Video(maps, instances, camera)
 

@@ -1,6 +1,7 @@
 """Motion bases: a level of rigid motions over time, each about its own pivot, and how points follow a few of them."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -36,6 +37,11 @@ class MotionLevel:
     def __len__(self) -> int:
         return self.pivots.shape[0]
 
+    @cached_property
+    def _moves(self) -> bool:
+        """Whether any basis is active, asked of its device once."""
+        return bool(self.active.any())
+
     def carry(
         self,
         positions: Float[Tensor, "b n 3"],
@@ -45,7 +51,7 @@ class MotionLevel:
         times: Float[Tensor, " b"] | Int[Tensor, " b"],
     ) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b n 4"]]:
         """Positions (m) and orientations (wxyz) moved by the bases that each point names, at the times of the batch."""
-        if not bool(self.active.any()):
+        if not self._moves:
             return positions, orientations
         affines = level_affines(self, times)
         blended = blend(affines, indices, logits)
@@ -61,7 +67,7 @@ class MotionLevel:
         times: Float[Tensor, " b"] | Int[Tensor, " b"],
     ) -> Float[Tensor, "b n 3"]:
         """Positions (m) as `carry` moves them, without orientations, which take most of its time."""
-        if not bool(self.active.any()):
+        if not self._moves:
             return positions
         return _applied(blend(level_affines(self, times), indices, logits), positions)
 
@@ -161,7 +167,7 @@ def _nearest_rotations(
     first, second = blended[..., 0], blended[..., 1]
     degenerate = torch.linalg.cross(first, second).norm(dim=-1, keepdim=True) < _DEGENERATE
     columns = torch.cat((first, second), dim=-1)
-    if degenerate.any():
+    if degenerate.is_cuda or degenerate.any():  # on a GPU, waiting for the answer takes longer
         heaviest = indices.gather(1, logits.argmax(dim=1, keepdim=True))[:, 0]
         single = affines[heaviest].transpose(0, 1)
         columns = torch.where(degenerate, torch.cat((single[..., 0], single[..., 1]), dim=-1), columns)

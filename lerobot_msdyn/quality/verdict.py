@@ -17,6 +17,7 @@ from lerobot_msdyn.quality.expected import Expected, expected_error
 from lerobot_msdyn.quality.witness import Witness, decibels, flicker, sharpness, stands_still
 from lerobot_msdyn.rendering import Rendering, draw
 from lerobot_msdyn.scene import DynamicScene
+from lerobot_msdyn.values import to_device
 
 HEAT_WIDTH = 24  # columns of the map of what is unseen
 CAUSES = {
@@ -79,7 +80,8 @@ def judge(windows: Sequence[Witnessed], camera: CameraTrack) -> Scores:
         error = expected_error(witness, poses)
         drawn, found = _draw(window, poses)
         pictures = drawn.rgb.clamp(0, 1)
-        following = draw(window.scene, poses, (witness.frames + 1).clamp(max=window.scene.frames - 1))
+        after = (witness.frames + 1).clamp(max=window.scene.frames - 1)
+        following = to_device(draw(window.scene, poses, after), "cpu")
         still = stands_still(drawn.moving > 0.05) & stands_still(following.moving > 0.05)
         steady += len(poses) * flicker(pictures, following.rgb.clamp(0, 1), still)
         own += len(poses) * witness.flicker
@@ -149,9 +151,9 @@ def _plain(value: Any) -> Any:
 
 
 def _draw(window: Witnessed, poses: CameraTrack) -> tuple[Rendering, list[Coverage]]:
-    """The witnesses' frames through other poses, and what is known about their pixels."""
+    """The witnesses' frames through other poses, and what is known about their pixels; on the host."""
     drawn = draw(window.scene, poses, window.witness.frames, extra=window.evidence.moving_frames)
-    return drawn, coverage_of(drawn, poses, window.witness.frames, window.evidence)
+    return to_device(drawn, "cpu"), coverage_of(drawn, poses, window.witness.frames, window.evidence)
 
 
 def _heat(unseen: Float[ndarray, "h w"]) -> list[list[int]]:

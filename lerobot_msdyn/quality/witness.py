@@ -19,6 +19,7 @@ from lerobot_msdyn.geometry import project, transform_points
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.rendering import draw
 from lerobot_msdyn.scene import DynamicScene
+from lerobot_msdyn.values import to_device
 
 WITNESSES = 3  # frames that are looked at where none was held out
 STILL_PX = 5  # side of the square around a pixel in which nothing may move for it to stand still
@@ -55,13 +56,13 @@ def decibels(error: float) -> float:
 
 @torch.no_grad()
 def witness(scene: DynamicScene, view: View, priors: Priors, held_out: Int[Tensor, " n"]) -> Witness:
-    """What a scene says of frames that it was not fitted to; of others where `held_out` is empty."""
+    """What a scene says of frames that it was not fitted to; of others where `held_out` is empty. It is on the host."""
     total = len(view.rgb)
     frames = held_out if len(held_out) else torch.linspace(0, total - 1, min(WITNESSES + 2, total)).round().long()
     if len(held_out) == 0 and total > WITNESSES + 1:
         frames = frames[1:-1]
     camera = view.camera.select(frames)
-    drawn = draw(scene, camera, frames)
+    drawn = to_device(draw(scene, camera, frames), "cpu")
     recorded = view.rgb[frames].float() / 255
     pictures = drawn.rgb.clamp(0, 1)
     following = (frames + 1).clamp(max=total - 1)
@@ -130,5 +131,5 @@ def _track_residual(scene: DynamicScene, camera: CameraTrack, priors: Priors) ->
 
 def _projected(scene: DynamicScene, camera: CameraTrack, time: int) -> Float[Tensor, "m 2"]:
     """Where the moving Gaussians are in the picture (px) at a frame."""
-    means = scene.at(torch.tensor([time])).means[0, len(scene.static) :]
+    means = scene.at(torch.tensor([time])).means[0, len(scene.static) :].cpu()
     return project(transform_points(camera.camera_from_world[time], means), camera.intrinsics[time])[0]

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lerobot_msdyn.errors import RenderError
+from lerobot_msdyn.render.availability import cuda_problem
 from lerobot_msdyn.render.reference import rasterize_reference
 from lerobot_msdyn.render.types import MAX_CPU_CHANNELS, Raster
 from lerobot_msdyn.render.validation import check_shapes
@@ -96,6 +97,9 @@ def _load(backend: str) -> tuple[Callable[..., Raster] | None, str]:
             from lerobot_msdyn.render.cpu import rasterize_cpu
 
             return rasterize_cpu, ""
+        problem = cuda_problem()
+        if problem:
+            return None, problem
         from lerobot_msdyn.render.cuda import rasterize_cuda
 
         return rasterize_cuda, ""

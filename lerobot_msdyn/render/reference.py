@@ -97,11 +97,7 @@ def _project(
     rotation = camera_from_world[:, :3, :3]
     in_camera = means @ rotation.transpose(-1, -2) + camera_from_world[:, None, :3, 3]
     views, count = in_camera.shape[:2]
-    z = in_camera[..., 2].clamp(min=near)
-    largest = torch.cat((in_camera[..., :2].abs(), scales.expand(views, count, 3)), dim=2).amax(2)
-    drawable = (in_camera[..., 2] > near) & (opacities >= MIN_ALPHA)
-    drawable &= largest * intrinsics[:, [0, 1], [0, 1]].amax(1, keepdim=True) < FURTHEST * z
-    view, gaussian = drawable.nonzero(as_tuple=True)
+    view, gaussian = drawable(in_camera, scales, opacities, intrinsics, near).nonzero(as_tuple=True)
     pair = view * count + gaussian
 
     def rows(values: Tensor, ndim: int) -> Tensor:
@@ -127,6 +123,20 @@ def _project(
         opacity=rows(opacities, 1),
         features=rows(features, 2),
     )
+
+
+def drawable(
+    in_camera: Float[Tensor, "b g 3"],
+    scales: Float[Tensor, "*#views g 3"],
+    opacities: Float[Tensor, "*#views g"],
+    intrinsics: Float[Tensor, "b 3 3"],
+    near: float,
+) -> Bool[Tensor, "b g"]:
+    """Which Gaussians are drawn, by their centres in the cameras (m): beyond the near plane, seen, not too large."""
+    z = in_camera[..., 2]
+    focal = intrinsics.diagonal(dim1=-2, dim2=-1)[:, :2].amax(1, keepdim=True)
+    largest = torch.cat((in_camera[..., :2].abs(), scales.expand_as(in_camera)), dim=2).amax(2)
+    return (z > near) & (opacities >= MIN_ALPHA) & (largest * focal < FURTHEST * z.clamp(min=near))
 
 
 def _perspective_jacobian(

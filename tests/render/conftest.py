@@ -20,10 +20,13 @@ class Scene:
     width: int
     height: int
 
-    def draw(self, backend: str, dtype: torch.dtype = torch.float32) -> tuple[Raster, list[Tensor]]:
+    def draw(
+        self, backend: str, dtype: torch.dtype = torch.float32, device: str = "cpu"
+    ) -> tuple[Raster, list[Tensor]]:
         """The images, and the leaves (Gaussians, then poses) that their gradients go to."""
-        leaves = [values.to(dtype).detach().clone().requires_grad_() for values in (*self.gaussians, self.poses)]
-        intrinsics = self.intrinsics.to(dtype)
+        tensors = [values.to(device, dtype) for values in (*self.gaussians, self.poses)]
+        leaves = [values.detach().clone().requires_grad_() for values in tensors]
+        intrinsics = self.intrinsics.to(device, dtype)
         return rasterize(*leaves, intrinsics, self.width, self.height, backend=backend), leaves
 
 
@@ -84,13 +87,16 @@ class Comparison:
     gradients: list[float]  # relative error of each leaf's gradient, thresholds' pixels left out
 
 
-def compare(scene: Scene, backend: str = "cpu", seed: int = 1) -> Comparison:
+def compare(
+    scene: Scene, backend: str = "cpu", seed: int = 1, device: str = "cpu", close_enough: float = 2e-5
+) -> Comparison:
     """Compare a backend in float32 with the reference in float64.
 
     Where rounding decides whether an alpha counts as below 1/255, or a pixel as opaque, the two differ by a finite
     step. Such pixels are counted, and receive no gradient.
     """
-    fast, fast_leaves = scene.draw(backend)
+    fast, fast_leaves = scene.draw(backend, device=device)
+    fast = Raster(fast.features.cpu(), fast.depth.cpu(), fast.alpha.cpu())
     exact, exact_leaves = scene.draw("reference", torch.float64)
     errors = [
         (fast.features - exact.features).abs().amax(-1),
@@ -98,7 +104,7 @@ def compare(scene: Scene, backend: str = "cpu", seed: int = 1) -> Comparison:
         (fast.alpha - exact.alpha).abs(),
     ]
     error = torch.stack(errors).amax(0)
-    close = error < 2e-5
+    close = error < close_enough
     generator = torch.Generator().manual_seed(seed)
     names = ("features", "depth", "alpha")
     incoming = [torch.randn(getattr(fast, name).shape, generator=generator) for name in names]
@@ -106,7 +112,7 @@ def compare(scene: Scene, backend: str = "cpu", seed: int = 1) -> Comparison:
     torch.autograd.backward([getattr(fast, name) for name in names], incoming)
     torch.autograd.backward([getattr(exact, name) for name in names], [values.double() for values in incoming])
     gradients = [
-        relative_error(a.grad, b.grad) for a, b in zip(fast_leaves, exact_leaves, strict=True) if b.numel() > 0
+        relative_error(a.grad.cpu(), b.grad) for a, b in zip(fast_leaves, exact_leaves, strict=True) if b.numel() > 0
     ]
     assert all(math.isfinite(value) for value in gradients)
     return Comparison((error > 1e-4).double().mean().item(), error[error <= 1e-4].max().item(), gradients)

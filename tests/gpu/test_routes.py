@@ -1,0 +1,46 @@
+"""The whole flow on a GPU and on the CPU ends at the same quality; skipped without a GPU."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from lerobot_msdyn import augment, pipeline
+from lerobot_msdyn.config import Device, Recipe
+from lerobot_msdyn.episode import View
+from lerobot_msdyn.render.availability import cuda_problem
+from lerobot_msdyn.synthetic import make_scene
+from lerobot_msdyn.views import new_pictures, on_device
+
+pytestmark = [pytest.mark.gpu, pytest.mark.slow]
+
+ROUTES: tuple[Device, Device] = ("cpu", "cuda")
+MAX_DIFFERENCE_DB = 0.2
+
+
+@pytest.fixture(autouse=True)
+def _gpu() -> None:
+    if cuda_problem():
+        pytest.skip(cuda_problem())
+
+
+def test_both_routes_reach_the_same_held_out_quality() -> None:
+    video = make_scene("push", 0, 40, 160, 120)
+    seen = video.render(video.camera)
+    found, pictures = {}, {}
+    for device in ROUTES:
+        recipe = Recipe(device=device)
+        recipe.fit.steps, recipe.priors.cache = 200, "off"
+        scene = pipeline.reconstruct(View(seen.rgb, video.camera, seen.depth), recipe)
+        assert scene.results[0].scene.device.type == "cpu"
+        found[device] = scene.witnesses[0].psnr_db
+        drawn = on_device(scene, torch.device(device))
+        pictures[device] = next(new_pictures(drawn, scene.camera)).rgb.astype(float)
+    assert abs(found["cuda"] - found["cpu"]) < MAX_DIFFERENCE_DB, found
+    assert abs(pictures["cuda"] - pictures["cpu"]).mean() < 2
+
+
+def test_the_command_on_a_gpu(desk: Path, tmp_path: Path) -> None:
+    flags = {"repo": "local/desk", "root": desk, "new_root": tmp_path / "new", "device": "cuda", "fit.steps": 8}
+    flags |= {"variants": 1, "workers": 2, "save_scenes": "true"}
+    assert augment.run([f"--{name}={value}" for name, value in flags.items()]) == 0
