@@ -106,9 +106,7 @@ def mutate_json(path: Path, rng: random.Random) -> str:
 
 def mutate_table(path: Path, rng: random.Random) -> str:
     table = pq.read_table(path)
-    name = rng.choice(
-        [column for column in table.column_names if not column.startswith("stats/")] or table.column_names
-    )
+    name = rng.choice(table.column_names)
     position = table.column_names.index(name)
     kind = rng.choice(["cell", "drop", "text", "null", "rename", "rows", "shuffle", "cell", "cell"])
     if kind == "drop":
@@ -317,11 +315,16 @@ def write_originals() -> None:
     scenes = [make_scene("push", 0, FRAMES, WIDTH, HEIGHT, episode=index) for index in range(3)]
     for name, dtype in (("video", "video"), ("image", "image")):
         write_dataset(scenes, "local/ds", SCRATCH / name, cameras=["front", "side"], depth=True, image_dtype=dtype)
+        (SCRATCH / name / "README.md").write_text("---\nlicense: mit\n---\nA desk.\n")
+        for path in (SCRATCH / name / "meta" / "episodes").rglob("*.parquet"):  # read in a tenth of the time without
+            table = pq.read_table(path)
+            unused = [column for column in table.column_names if column.startswith("stats/")]
+            pq.write_table(table.drop_columns(unused), path)
 
 
 def main() -> int:
     """Print a summary; 0 if nothing went wrong."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--numbers", type=int, nargs="+")
