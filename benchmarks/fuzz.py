@@ -55,7 +55,8 @@ GRACE_S = 30  # after the limit, a process that ignores it is killed
 BATCH = 40
 WHOLE_EVERY = 50
 FRAMES, WIDTH, HEIGHT = 4, 32, 24
-FLAGS = ["--cameras=[front]", "--variants=1", "--fit.steps=1", "--fit.max_width=16", "--scene.moving_gaussians=50"]
+FLAGS = ["--workers=1", "--cameras=[front]", "--variants=1", "--fit.steps=1", "--fit.max_width=16"]
+FLAGS += ["--scene.moving_gaussians=50"]
 NASTY: list[Any] = [
     None, True, False, 0, -1, 1, 3, 0.5, -0.0, 1e308, 1e-300, float("nan"), float("inf"), 10**12, 2**63, 10**30,
     "", " ", "..", "../../..", "/etc/passwd", "a/b", "\x00", "\u202e", "x" * 5000, "{", "}", "{}", "{0}", "{a}", "%s",

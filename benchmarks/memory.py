@@ -2,7 +2,7 @@
 
     python benchmarks/memory.py [--episodes 2 8 24] [--frames 60 300 1000 3000] [--size 64x48] [--json FILE] [-- FLAGS]
 
-Made-up datasets with recorded depth: for each of `--episodes` that many of 12 frames, and for each of `--frames` one
+One process works (`--workers=1`) on made-up datasets with recorded depth: for each of `--episodes` that many of 12 frames, and for each of `--frames` one
 episode of that many. Every run of the command is a process of its own, which begins with what its imports take (the
 first line). The flags behind `--` are those of `lerobot_msdyn.augment`; few steps and Gaussians unless they say more.
 """
@@ -30,7 +30,7 @@ from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.dataset import write_dataset
 
 SHORT = 12  # frames of the episodes of which there are several
-BUDGET = ["--variants=1", "--fit.steps=10", "--scene.moving_gaussians=500", "--scene.moving_frames=4"]
+BUDGET = ["--workers=1", "--variants=1", "--fit.steps=10", "--scene.moving_gaussians=500", "--scene.moving_frames=4"]
 FORK = multiprocessing.get_context("fork")
 
 
