@@ -2,9 +2,10 @@
 
     python benchmarks/memory.py [--episodes 2 8 24] [--frames 60 300 1000 3000] [--size 64x48] [--json FILE] [-- FLAGS]
 
-One process works (`--workers=1`) on made-up datasets with recorded depth: for each of `--episodes` that many of 12 frames, and for each of `--frames` one
-episode of that many. Every run of the command is a process of its own, which begins with what its imports take (the
-first line). The flags behind `--` are those of `lerobot_msdyn.augment`; few steps and Gaussians unless they say more.
+One process works (`--workers=1`) on made-up datasets with recorded depth: for each of `--episodes` that many of 12
+frames, and for each of `--frames` one episode of that many. Every run of the command is a process of its own, which
+begins with what its imports take (the first line). The flags behind `--` are those of `lerobot_msdyn.augment`; few
+steps and Gaussians unless they say more.
 """
 
 import argparse
