@@ -360,6 +360,8 @@ class AugmentConfig(Recipe):
     new_root: Path | None = None
     # Source episodes to use, e.g. '[0,3]'; default: all.
     episodes: list[int] | None = None
+    # Processes that work on episodes at once; 0: one per core, as far as memory allows. The result is the same.
+    workers: int = 0
     # Report what would be done (episodes, disk, time) and stop.
     dry_run: bool = False
     # Throw away what an unfinished run for the same output has finished, instead of going on with it.

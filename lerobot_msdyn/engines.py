@@ -1,7 +1,10 @@
-"""Who runs which episode: for now this process, one after the other."""
+"""Who runs which episode: this process, or several on this machine."""
 
+import contextlib
 import functools
 import logging
+from collections.abc import Callable, Generator
+from dataclasses import replace
 
 from lerobot.datasets import LeRobotDatasetMetadata
 from tqdm import tqdm
@@ -12,8 +15,8 @@ from lerobot_msdyn.episode import depth_key_of
 from lerobot_msdyn.errors import ConfigError, EpisodeError, MsdynError
 from lerobot_msdyn.estimate import measure_speeds, predicted_seconds
 from lerobot_msdyn.pipeline import augment_episode
-from lerobot_msdyn.sharing import shared_backgrounds
 from lerobot_msdyn.video import quiet_encoders
+from lerobot_msdyn.workers import Work, Workers, threads_of_one, workers_for
 from lerobot_msdyn.write import NewEpisode, OutputDataset
 
 logger = logging.getLogger(__name__)
@@ -26,7 +29,7 @@ def run_local(
     config: AugmentConfig,
     output: OutputDataset,
 ) -> tuple[list[NewEpisode], list[EpisodeError]]:
-    """All episodes in this process; an episode that cannot be read is reported and left out."""
+    """All episodes on this machine; an episode that cannot be read is reported and left out."""
     if config.device == "cuda":
         raise ConfigError("device is 'cuda', which this version cannot draw on; use --device cpu")
     quiet_encoders()
@@ -42,21 +45,60 @@ def run_local(
             bar.update(min(share, len(episodes) - bar.n))  # shares add up to one only up to rounding
 
         bar.set_description_str("looking at the background")
-        backgrounds = output.staging.keep("backgrounds", lambda: shared_backgrounds(source, cameras, config))
-        for done, index in enumerate(episodes, start=1):
-            try:
-                make = functools.partial(augment_episode, source, index, cameras, config, output, progress, backgrounds)
-                new += output.finish_episode(index, make)
-            except EpisodeError as error:
-                logger.error("skipped: %s", error)
-                failures.append(error)
-            except MsdynError:
-                raise
-            except Exception as error:  # hours of other episodes' work must not be lost to a fault in one
-                logger.exception("skipped episode %d: a fault of lerobot_msdyn, please report it", index)
-                failures.append(EpisodeError(f"{source.repo_id} episode {index}: {type(error).__name__}: {error}"))
-            bar.update(done - bar.n)
+        work = Work(source, cameras, config, output, progress)
+        with contextlib.closing(_attempts(work, episodes)) as attempts:  # workers end before the lock is let go
+            for index, failure in zip(episodes, attempts, strict=True):
+                if failure is None:
+                    new += output.finish_episode(index, _make(work, index))
+                else:
+                    failures.append(EpisodeError(failure))
+        bar.update(len(episodes) - bar.n)
     return new, failures
+
+
+def _attempts(work: Work, episodes: list[int]) -> Generator[str | None]:
+    """Why each episode failed, or nothing; by this process or, where that pays, by several."""
+    unfinished = [index for index in episodes if not work.output.is_finished(index)]
+    frames = sum(int(work.source.episodes[index]["length"]) for index in unfinished)
+    count = workers_for(work.config, frames, len(unfinished))
+    if count == 1:
+        for index in episodes:
+            yield attempt(work, index)
+        return
+    logger.info("%d episodes at once (--workers)", count)
+    with Workers(count, work) as workers:
+        _ = replace(work, run=workers.moving).backgrounds  # before they are asked for by all at once
+        yield from workers.map(attempt, episodes)
+
+
+def attempt(work: Work, index: int) -> str | None:
+    """Finish one episode; returns why that is not possible."""
+    make = _make(work, index)
+    try:
+        work.output.finish_episode(index, make)
+    except EpisodeError as error:
+        logger.error("skipped: %s", error)
+        return str(error)
+    except MsdynError:
+        raise
+    except Exception as error:  # hours of other episodes' work must not be lost to a fault in one
+        logger.exception("skipped episode %d: a fault of lerobot_msdyn, please report it", index)
+        return f"{work.source.repo_id} episode {index}: {type(error).__name__}: {error}"
+    return None
+
+
+def _make(work: Work, index: int) -> Callable[[], list[NewEpisode]]:
+    """What makes all new episodes of one."""
+    return functools.partial(
+        augment_episode,
+        work.source,
+        index,
+        work.cameras,
+        work.config,
+        work.output,
+        work.progress,
+        work.backgrounds,
+    )
 
 
 def plan(source: LeRobotDatasetMetadata, episodes: list[int], cameras: list[str], config: AugmentConfig) -> str:
@@ -65,13 +107,16 @@ def plan(source: LeRobotDatasetMetadata, episodes: list[int], cameras: list[str]
     copies = config.variants + int(config.include_source)
     size = sum(file.stat().st_size for file in source.root.rglob("*") if file.is_file())
     disk = size * frames * copies / max(source.total_frames, 1)
-    seconds = predicted_seconds(measure_speeds(source, episodes[0], cameras, config), source, episodes, config)
+    count = workers_for(config, frames, len(episodes))
+    with threads_of_one(count):
+        speeds = measure_speeds(source, episodes[0], cameras, config)
+    seconds = predicted_seconds(speeds, source, episodes, config, count)
     return (
         f"{source.repo_id}: {len(episodes)} episodes, {frames} frames; re-rendering {', '.join(cameras)}\n"
         f"{config.variants} new per episode: {len(episodes) * copies} episodes, {frames * copies} frames, "
         f"{frames * config.variants * len(cameras)} new pictures\n"
         f"about {disk / 1e6:.0f} MB on disk, and about {seconds / 60:.1f} minutes on this machine, "
-        "judging by a few frames and steps\n"
+        f"by {count} {'process' if count == 1 else 'processes'}, judging by a few frames and steps\n"
     )
 
 

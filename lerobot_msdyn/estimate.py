@@ -73,21 +73,25 @@ def measure_speeds(source: LeRobotDatasetMetadata, index: int, cameras: list[str
     return Speeds(read_s, prepare_s, step_s, render_s)
 
 
-def predicted_seconds(speeds: Speeds, source: LeRobotDatasetMetadata, episodes: list[int], recipe: Recipe) -> float:
-    """Time of a whole run."""
-    lengths = [int(source.episodes[index]["length"]) for index in episodes]
-    steps, seconds = float(recipe.fit.steps), 0.0
+def predicted_seconds(
+    speeds: Speeds, source: LeRobotDatasetMetadata, episodes: list[int], recipe: Recipe, workers: int = 1
+) -> float:
+    """Time of a whole run by so many workers; `speeds` are those of one, on its share of the cores."""
+    steps, background_s = float(recipe.fit.steps), 0.0
     if recipe.scene.shared_background and source.total_episodes > 1:
         indices = looked_at(source.total_episodes)
         apart = len(set(indices) - set(episodes))  # the masks of the others serve for their own fit as well
-        each_s = 2 * len(indices) * speeds.read_s + apart * MASKS_SHARE * speeds.prepare_s
-        seconds = each_s * source.total_frames / source.total_episodes + steps / 2 * speeds.step_s
+        masks_s = (len(indices) * speeds.read_s + apart * MASKS_SHARE * speeds.prepare_s) / workers
+        each_s = len(indices) * speeds.read_s + masks_s
+        background_s = each_s * source.total_frames / source.total_episodes + steps / 2 * speeds.step_s
         steps *= FURTHER_STEPS
-    for frames in lengths:
+    busy_s = [0.0] * workers
+    for index in episodes:
+        frames = int(source.episodes[index]["length"])
         windows = -(-frames // recipe.fit.window_frames)
-        seconds += frames * (speeds.read_s + speeds.prepare_s + recipe.variants * speeds.render_s)
-        seconds += windows * steps * speeds.step_s
-    return seconds
+        one_s = frames * (speeds.read_s + speeds.prepare_s + recipe.variants * speeds.render_s)
+        busy_s[busy_s.index(min(busy_s))] += one_s + windows * steps * speeds.step_s
+    return background_s + max(busy_s)
 
 
 def _middle(view: View) -> View:

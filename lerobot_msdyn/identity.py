@@ -17,7 +17,7 @@ from lerobot_msdyn.config import AugmentConfig, Recipe
 from lerobot_msdyn.files import DIGEST_BYTES, digest_of_file
 
 LIBRARIES = ("lerobot_msdyn", "lerobot", "torch", "numpy", "opencv-python-headless", "av", "numba", "pyarrow")
-PLACES = ("root", "new_root", "dry_run", "restart")  # settings that do not change what is made
+PLACES = ("root", "new_root", "dry_run", "restart", "workers")  # settings that do not change what is made
 
 
 def describe_run(root: Path, files: Iterable[Path], config: AugmentConfig) -> dict[str, Any]:
@@ -69,7 +69,9 @@ def code_digest() -> str:
 def recipe_text(config: Recipe) -> str:
     """The settings as a recipe file, without the user's folders."""
     known = {item.name for item in dataclasses.fields(Recipe)}
-    return yaml.safe_dump({key: value for key, value in draccus.encode(config).items() if key in known})
+    settings = {key: value for key, value in draccus.encode(config).items() if key in known}
+    settings["priors"].pop("cache")
+    return yaml.safe_dump(settings)
 
 
 def _named_files(settings: Any) -> list[Path]:

@@ -214,8 +214,8 @@ def reconstruct(
     parts = windows(view, recipe)
     if len(parts) > 1 and not backgrounds and recipe.scene.shared_background:
 
-        def moving(number: int, frames: Tensor) -> Tensor:
-            return moving_in_few(parts[number][1], recipe, frames, episode, key)
+        def moving(numbers: Sequence[int], frames: Tensor) -> list[Tensor]:
+            return [moving_in_few(parts[number][1], recipe, frames, episode, key) for number in numbers]
 
         with torch_on_one_thread():
             backgrounds = share([shrink(few_frames(part), recipe.fit.max_width) for _, part in parts], moving, recipe)

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 
 import cv2
@@ -30,8 +30,8 @@ ALIKE_GREY_LEVELS = 12.0  # difference up to which two pictures show the same
 ALIKE_DEPTH = 0.02  # relative difference up to which depths are of one surface
 AFFINE_ROUNDS = 3
 
-# (number of a view, frames of all views beside it) -> what moves in it, 0 = nothing
-MovingIn = Callable[[int, UInt8[Tensor, "m h w 3"]], UInt8[Tensor, "t h w"]]
+# (numbers of views, frames of all views beside them) -> what moves in each, 0 = nothing
+MovingIn = Callable[[Sequence[int], UInt8[Tensor, "m h w 3"]], Iterable[UInt8[Tensor, "t h w"]]]
 
 
 @dataclass(frozen=True)
@@ -78,14 +78,14 @@ def same_places(views: list[View]) -> list[list[int]]:
 def pooled(views: list[View], numbers: list[int], moving: MovingIn) -> SharedBackground:
     """What some frames of several videos from one place show together.
 
-    `moving` is asked what moves in the frames of each view, by its number, and given the frames of all of them.
+    `moving` is asked what moves in the frames of the views, by their numbers, and given the frames of all of them.
     """
     frames = torch.cat([view.rgb for view in views])
     depths: list[Float[Tensor, "t h w"]] = []
     for view in views:
         unknown = torch.zeros(view.rgb.shape[:3])
         depths.append(unknown if view.depth is None else clean_recorded_depth(view.depth, *view.depth_range))
-    instances = torch.cat([moving(number, frames) for number in numbers])
+    instances = torch.cat(list(moving(numbers, frames)))
     return SharedBackground(empty_scene(frames, torch.cat(depths), instances), views[0].camera.select([0]), frames)
 
 

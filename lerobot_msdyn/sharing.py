@@ -4,13 +4,16 @@ import contextlib
 import dataclasses
 import itertools
 import logging
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from jaxtyping import UInt8
 from lerobot.datasets import LeRobotDatasetMetadata
+from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.config import Recipe
@@ -41,10 +44,26 @@ NEAR = 0.01  # of the look-at distance, within which nothing is drawn: depth may
 Backgrounds = Mapping[str, Sequence[SharedBackground]]  # by camera
 
 
-def shared_backgrounds(source: LeRobotDatasetMetadata, cameras: list[str], recipe: Recipe) -> Backgrounds:
+@dataclass(frozen=True)
+class MaskTask:
+    """What moves in some frames of one camera's video: what is asked of `moving_in_episode`."""
+
+    episode: int
+    key: str
+    recipe: Recipe
+    frames: UInt8[ndarray, "m h w 3"]  # of all episodes that are looked at
+
+
+Run = Callable[[Callable[[LeRobotDatasetMetadata, MaskTask], Any], list[MaskTask]], Iterable[Any]]
+
+
+def shared_backgrounds(
+    source: LeRobotDatasetMetadata, cameras: list[str], recipe: Recipe, run: Run | None = None
+) -> Backgrounds:
     """Per camera, what some of its episodes show together, fitted once; one for every place in which it stood.
 
-    Episodes that cannot be read are left out here, and reported when it is their turn.
+    Episodes that cannot be read are left out here, and reported when it is their turn. `run` calls a function with the
+    source and each of some tasks, in this process or in others; by default in this one.
     """
     episodes = background_episodes(source, recipe)
     if not episodes:
@@ -57,19 +76,31 @@ def shared_backgrounds(source: LeRobotDatasetMetadata, cameras: list[str], recip
                 views[key][index] = shrink(few_frames(view), recipe.fit.max_width)
     found: dict[str, list[SharedBackground]] = {}
     for key, some in views.items():
+        indices = list(some)
 
-        def moving(number: int, frames: Tensor, key: str = key, some: dict[int, View] = some) -> Tensor:
-            index = list(some)[number]
-            view = read_episode(source, index, [key], recipe.camera, recorded_depth=False).views[key]
-            try:
-                return moving_in_few(view, recipe, frames, index, key)
-            except PriorError as error:  # a file of masks may be there for some episodes alone
-                logger.warning("shared background: episode %d is left out: %s", index, error)
-                return torch.ones(len(some[index].rgb), *frames.shape[1:3], dtype=torch.uint8)
+        def moving(
+            numbers: Sequence[int], frames: Tensor, key: str = key, indices: list[int] = indices
+        ) -> Iterable[Tensor]:
+            tasks = [MaskTask(indices[number], key, recipe, frames.numpy()) for number in numbers]
+            found = (
+                (moving_in_episode(source, task) for task in tasks) if run is None else run(moving_in_episode, tasks)
+            )
+            return map(torch.from_numpy, found)
 
         with torch_on_one_thread():
             found[key] = share(list(some.values()), moving, recipe)
     return found
+
+
+def moving_in_episode(source: LeRobotDatasetMetadata, task: MaskTask) -> UInt8[ndarray, "t h w"]:
+    """What moves in those frames of an episode that `few_frames` takes; everything, where no masks can be had."""
+    view = read_episode(source, task.episode, [task.key], task.recipe.camera, recorded_depth=False).views[task.key]
+    try:
+        with torch_on_one_thread():
+            return moving_in_few(view, task.recipe, torch.from_numpy(task.frames), task.episode, task.key).numpy()
+    except PriorError as error:  # a file of masks may be there for some episodes alone
+        logger.warning("shared background: episode %d is left out: %s", task.episode, error)
+        return np.ones((len(few(len(view.rgb))), *task.frames.shape[1:3]), np.uint8)
 
 
 def background_episodes(source: LeRobotDatasetMetadata, recipe: Recipe) -> list[int]:

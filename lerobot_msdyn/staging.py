@@ -87,13 +87,19 @@ class Kept:
 class Staging(Kept):
     """The work folder of one output, locked. Use as a context; leaving it keeps what is there."""
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, *, lock: bool = True) -> None:
         """Make and lock the folder.
+
+        Args:
+            root: the place of the output.
+            lock: false in a process that works for the one that holds the lock.
 
         Raises:
             OutputError: another run holds it, or it cannot be written.
         """
         super().__init__(work_folder(root))
+        if not lock:
+            return
         owner = self.folder / "owner"
         self._lock = FileLock(self.folder / "lock")
         try:

@@ -29,6 +29,7 @@ SCALE = 0.7  # of a pixel's Gaussian: its neighbours are drawn as well
 ENLARGED_SCALE = 1.0  # where pictures are drawn larger than they were fitted, and gaps would open between them
 ERROR_AROUND = 0.04  # the same over several pixels of the moving set, all of which it then condemns
 _SMOOTH_PX, _AROUND_PX = 1.0, 8.0
+_BESIDE = np.ones((3, 3), np.uint8)  # a pixel and those beside it
 
 
 def unexplained(
@@ -56,7 +57,7 @@ def unexplained(
         if still is None or not view.camera.is_static:
             still = draw(scene.still(), camera, when, backend).depth[0]
         drawn = draw(scene, camera, when, backend)
-        wrong = _wrong(drawn, view.rgb[frame].float() / 255, depth, tolerance)
+        wrong = _wrong(drawn, view.rgb[frame].float() / 255, depth.numpy(), tolerance)
         taken = wrong & ~_behind_an_edge(depth.numpy(), still.numpy())
         patches.append(_patch(scene, view, depth, frame, wrong, taken, scale, backend))
     overlay = packed(patches)
@@ -73,27 +74,37 @@ def depth_tolerance(priors: Priors) -> float:
 
 
 def _wrong(
-    drawn: Rendering, recorded: Float[Tensor, "h w 3"], depth: Float[Tensor, "h w"], tolerance: float
+    drawn: Rendering, recorded: Float[Tensor, "h w 3"], depth: Float[ndarray, "h w"], tolerance: float
 ) -> Bool[ndarray, "h w"]:
     """Where a drawn picture has another colour or depth (m) than the recorded one, and the pixels beside."""
     difference = (drawn.rgb[0].clamp(0, 1) - recorded).abs().mean(-1).numpy()
-    apart = (drawn.depth[0] / depth - 1).abs().numpy()
+    found = drawn.depth[0].numpy()
     moving = (drawn.moving[0] > 0.5).numpy()
     around = _blurred(difference * moving, _AROUND_PX) > ERROR_AROUND * _blurred(moving, _AROUND_PX)
-    wrong = (_blurred(difference, _SMOOTH_PX) > COLOUR_ERROR) | (apart > tolerance) | (moving & around)
+    wrong = (_blurred(difference, _SMOOTH_PX) > COLOUR_ERROR) | (np.abs(found / depth - 1) > tolerance)
+    wrong |= moving & around
+    # Behind an edge colours are mixed, and say nothing; there only the depth of no pixel beside counts as wrong.
+    apart = (depth < (1 - tolerance) * cv2.erode(found, _BESIDE)) | (
+        depth > (1 + tolerance) * cv2.dilate(found, _BESIDE)
+    )
+    wrong = np.where(_behind(depth), apart, wrong)
     opened = cv2.morphologyEx(wrong.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
-    return cv2.dilate(opened, np.ones((3, 3), np.uint8)) > 0
+    return cv2.dilate(opened, _BESIDE) > 0
 
 
 def _blurred(image: Float[ndarray, "h w"] | Bool[ndarray, "h w"], sigma_px: float) -> Float[ndarray, "h w"]:
     return cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma_px)
 
 
+def _behind(depth: Float[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
+    """Pixels beside a nearer surface."""
+    return depth > (1 + JUMP) * cv2.erode(depth, _BESIDE)
+
+
 def _behind_an_edge(depth: Float[ndarray, "h w"], still: Float[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
     """Pixels beside a nearer surface, whose colours mix with its own, that float or that the static set shows."""
-    window = np.ones((3, 3), np.uint8)
-    behind = depth > (1 + JUMP) * cv2.erode(depth, window)
-    floating = behind & ((1 + JUMP) * depth < cv2.dilate(depth, window))
+    behind = _behind(depth)
+    floating = behind & ((1 + JUMP) * depth < cv2.dilate(depth, _BESIDE))
     return floating | (behind & (np.abs(still / depth - 1) < DEPTH_ERROR))
 
 

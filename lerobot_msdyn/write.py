@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.datasets.compute_stats import compute_episode_stats
-from lerobot.datasets.io_utils import write_info, write_tasks
+from lerobot.datasets.io_utils import write_info, write_stats, write_tasks
 from lerobot.datasets.utils import update_chunk_file_indices
 from lerobot.datasets.video_utils import concatenate_video_files, get_video_duration_in_s
 
@@ -92,6 +92,10 @@ class OutputDataset:
         folder = self.episode(index).folder / f"variant_{variant:02d}"
         pictures = stage_pictures(self.source, folder, frames, int(self.source.episodes[index]["length"]))
         return NewEpisode(index, provenance, pictures)
+
+    def is_finished(self, index: int) -> bool:
+        """Whether all new episodes of one source episode are made."""
+        return self.episode(index).has(FINISHED)
 
     def finish_episode(self, index: int, make: Callable[[], list[NewEpisode]]) -> list[NewEpisode]:
         """All new episodes of one source episode, made once; what the source has to offer is copied and checked first.
@@ -251,6 +255,8 @@ class _Assembly:
             self._place_videos(key, episodes, places)
         self._place_rows(episodes, places)
         self.meta.finalize()
+        # LeRobot lists features in the order of a set, which is another in every process.
+        write_stats(dict(sorted((self.meta.stats or {}).items())), self.folder)
 
     def _place_videos(self, key: str, episodes: list[NewEpisode], places: list[dict[str, Any]]) -> None:
         """Concatenate one camera's videos into files of bounded size; copies and renders never share a file."""

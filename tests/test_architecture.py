@@ -30,6 +30,7 @@ ONLY_IN = {
         "sharing",
         "pipeline",
         "estimate",
+        "workers",
         "engines",
         "report",
         "augment",

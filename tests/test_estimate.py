@@ -27,3 +27,7 @@ def test_parts_are_added_up(desk: Path) -> None:
     recipe.scene.shared_background = True
     shared = 2 * 3 * 12 * 1 + 12 * 0.3 * 2 + 50 * 3 + 2 * (12 * (1 + 2 + 2 * 4) + 2 * 60 * 3)
     assert predicted_seconds(speeds, source, [0, 2], recipe) == pytest.approx(shared)
+    two = predicted_seconds(speeds, source, [0, 2], recipe, workers=2)  # an episode each, and the masks of one
+    assert two == pytest.approx(
+        (1 + 0.5) * 3 * 12 * 1 + 0.5 * 12 * 0.3 * 2 + 50 * 3 + 12 * (1 + 2 + 2 * 4) + 2 * 60 * 3
+    )

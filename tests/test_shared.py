@@ -44,7 +44,9 @@ def episode(block_column: int, wall: np.ndarray, shift: int = 0) -> View:
 
 def moving(views: list[View], wall: np.ndarray) -> MovingIn:
     """The block."""
-    return lambda number, frames: (views[number].rgb != torch.from_numpy(wall)).any(-1).to(torch.uint8)
+    return lambda numbers, frames: [
+        (views[number].rgb != torch.from_numpy(wall)).any(-1).to(torch.uint8) for number in numbers
+    ]
 
 
 def shared_by(views: list[View], wall: np.ndarray) -> list[SharedBackground]:
@@ -70,7 +72,10 @@ def test_a_camera_that_was_moved_has_its_own_background() -> None:
         episode(4, texture(1)),
     ]
     nothing = torch.zeros(FRAMES, HEIGHT, WIDTH, dtype=torch.uint8)
-    found = [pooled([views[i] for i in group], group, lambda *_: nothing) for group in same_places(views)]
+    found = [
+        pooled([views[i] for i in group], group, lambda numbers, _: [nothing for _ in numbers])
+        for group in same_places(views)
+    ]
     assert len(found) == 2
     assert [group.fits(views[0]) for group in found] == [True, False]
     assert [group.fits(views[2]) for group in found] == [False, True]
