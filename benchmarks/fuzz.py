@@ -1,11 +1,12 @@
 """Run the command on datasets that are broken in random ways, and see that it always ends well.
 
-python benchmarks/fuzz.py [--count 2000] [--seed 0] [--numbers 17 94]
+python benchmarks/fuzz.py [--count 2000] [--seed 0] [--numbers 17 94] [--limit 120]
 
-Every run must end by itself within two minutes with exit code 0, 1 or 2, show no traceback, leave the source and
-everything beside the output as they were, and leave an output that LeRobot opens, or none. Rendering is replaced by
-turning the recorded pictures upside down, but for every 50th run: what is tried is reading and writing. Runs are made
-in processes of their own, 40 in each: one that crashes or hangs is counted, and the next process goes on after it.
+Every run must end by itself within `--limit` seconds (give it more on a busy machine) with exit code 0, 1 or 2, show no
+traceback, leave the source and everything beside the output as they were, and leave an output that LeRobot opens, or
+none. Rendering is replaced by turning the recorded pictures upside down, but for every 50th run: what is tried is
+reading and writing. Runs are made in processes of their own, 40 in each: one that crashes or hangs is counted, and the
+next process goes on after it.
 `--numbers` repeats single runs of the seed.
 """
 
@@ -50,12 +51,12 @@ from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.dataset import write_dataset
 from lerobot_msdyn.write import NewEpisode
 
-LIMIT_S = 120
-DEAD_S = LIMIT_S + 30  # a process that ignores the limit is killed
+GRACE_S = 30  # after the limit, a process that ignores it is killed
 BATCH = 40
 WHOLE_EVERY = 50
 FRAMES, WIDTH, HEIGHT = 4, 32, 24
-FLAGS = ["--cameras=[front]", "--variants=1", "--fit.steps=1", "--fit.max_width=16", "--scene.moving_gaussians=50"]
+FLAGS = ["--workers=1", "--cameras=[front]", "--variants=1", "--fit.steps=1", "--fit.max_width=16"]
+FLAGS += ["--scene.moving_gaussians=50"]
 NASTY: list[Any] = [
     None, True, False, 0, -1, 1, 3, 0.5, -0.0, 1e308, 1e-300, float("nan"), float("inf"), 10**12, 2**63, 10**30,
     "", " ", "..", "../../..", "/etc/passwd", "a/b", "\x00", "\u202e", "x" * 5000, "{", "}", "{}", "{0}", "{a}", "%s",
@@ -106,9 +107,7 @@ def mutate_json(path: Path, rng: random.Random) -> str:
 
 def mutate_table(path: Path, rng: random.Random) -> str:
     table = pq.read_table(path)
-    name = rng.choice(
-        [column for column in table.column_names if not column.startswith("stats/")] or table.column_names
-    )
+    name = rng.choice(table.column_names)
     position = table.column_names.index(name)
     kind = rng.choice(["cell", "drop", "text", "null", "rename", "rows", "shuffle", "cell", "cell"])
     if kind == "drop":
@@ -218,13 +217,13 @@ def break_copy(original: Path, place: Path, rng: random.Random) -> str:
     return "; ".join(broken)
 
 
-def command(place: Path, *, whole: bool) -> tuple[int | None, list[str], str]:
+def command(place: Path, limit_s: int, *, whole: bool) -> tuple[int | None, list[str], str]:
     """Run the command on `place`/ds; the exit code, what went wrong, and what was said."""
     said, code, faults = io.StringIO(), None, []
     engines.augment_episode = REAL if whole else fake_episode
     logging.basicConfig(level=logging.INFO, stream=said, force=True)
     begin = time.perf_counter()
-    signal.alarm(LIMIT_S)
+    signal.alarm(limit_s)
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
             names = ["--repo=local/ds", f"--root={place / 'ds'}", f"--new_root={place / 'out'}"]
@@ -235,8 +234,8 @@ def command(place: Path, *, whole: bool) -> tuple[int | None, list[str], str]:
         faults.append(f"{type(error).__name__} {error}")
     finally:
         signal.alarm(0)
-    if time.perf_counter() - begin > LIMIT_S:
-        faults.append(f"more than {LIMIT_S} s")
+    if time.perf_counter() - begin > limit_s:
+        faults.append(f"more than {limit_s} s")
     if code not in (0, 1, 2):
         faults.append(f"exit code {code}")
     text = said.getvalue()
@@ -247,11 +246,11 @@ def command(place: Path, *, whole: bool) -> tuple[int | None, list[str], str]:
     return code, faults, text
 
 
-def trial(place: Path, *, whole: bool) -> tuple[int | None, list[str], str]:
+def trial(place: Path, limit_s: int, *, whole: bool) -> tuple[int | None, list[str], str]:
     """The command on the broken copy in `place`, and all that it must not have done."""
     source, out = place / "ds", place / "out"
     before, here = listing(source), set(listing(Path.cwd()))
-    code, faults, text = command(place, whole=whole)
+    code, faults, text = command(place, limit_s, whole=whole)
     if listing(source) != before:
         faults.append("the source was touched")
     there = {path.name for path in place.iterdir()}
@@ -268,36 +267,36 @@ def trial(place: Path, *, whole: bool) -> tuple[int | None, list[str], str]:
     return code, faults, text
 
 
-def batch(numbers: list[int], seed: int, send: Connection) -> None:
+def batch(numbers: list[int], seed: int, limit_s: int, send: Connection) -> None:
     """Some trials; for each, what was broken is sent before it, and what came of it after it."""
     faulthandler.enable()
     signal.signal(signal.SIGALRM, late)
     for number in numbers:
         rng = random.Random(seed * 1_000_003 + number)
         send.send(break_copy(SCRATCH / ("image" if number % 4 == 3 else "video"), SCRATCH / "place", rng))
-        send.send(trial(SCRATCH / "place", whole=number % WHOLE_EVERY == 0))
+        send.send(trial(SCRATCH / "place", limit_s, whole=number % WHOLE_EVERY == 0))
     shutil.rmtree(SCRATCH / "hf", ignore_errors=True)
 
 
 def late(*_: Any) -> None:
     """The limit is over."""
-    raise TimeoutError(f"more than {LIMIT_S} s")
+    raise TimeoutError("the limit is over")
 
 
-def trials(numbers: list[int], seed: int) -> Iterator[tuple[int, str, int | None, list[str], str]]:
+def trials(numbers: list[int], seed: int, limit_s: int) -> Iterator[tuple[int, str, int | None, list[str], str]]:
     """Number, what was broken, exit code, faults and text of each trial, whatever it does to its process."""
     while numbers:
         receive, send = FORK.Pipe(duplex=False)
-        process = FORK.Process(target=batch, args=(numbers[:BATCH], seed, send))
+        process = FORK.Process(target=batch, args=(numbers[:BATCH], seed, limit_s, send))
         process.start()
         send.close()
         for number in numbers[:BATCH]:
             broken = "?"
             try:
-                if not receive.poll(DEAD_S):
+                if not receive.poll(limit_s + GRACE_S):
                     raise TimeoutError
                 broken = receive.recv()
-                if not receive.poll(DEAD_S):
+                if not receive.poll(limit_s + GRACE_S):
                     raise TimeoutError
                 outcome = receive.recv()
             except (TimeoutError, EOFError) as error:
@@ -317,14 +316,20 @@ def write_originals() -> None:
     scenes = [make_scene("push", 0, FRAMES, WIDTH, HEIGHT, episode=index) for index in range(3)]
     for name, dtype in (("video", "video"), ("image", "image")):
         write_dataset(scenes, "local/ds", SCRATCH / name, cameras=["front", "side"], depth=True, image_dtype=dtype)
+        (SCRATCH / name / "README.md").write_text("---\nlicense: mit\n---\nA desk.\n")
+        for path in (SCRATCH / name / "meta" / "episodes").rglob("*.parquet"):  # read in a tenth of the time without
+            table = pq.read_table(path)
+            unused = [column for column in table.column_names if column.startswith("stats/")]
+            pq.write_table(table.drop_columns(unused), path)
 
 
 def main() -> int:
     """Print a summary; 0 if nothing went wrong."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--numbers", type=int, nargs="+")
+    parser.add_argument("--limit", type=int, default=120, help="seconds that a run may take")
     options = parser.parse_args()
     work = SCRATCH / "work"
     work.mkdir()
@@ -336,7 +341,7 @@ def main() -> int:
     codes: collections.Counter[int | None] = collections.Counter()
     bad = []
     begin = time.perf_counter()
-    for done, (number, broken, code, faults, text) in enumerate(trials(numbers, options.seed), 1):
+    for done, (number, broken, code, faults, text) in enumerate(trials(numbers, options.seed, options.limit), 1):
         codes[code] += 1
         if faults:
             bad.append(number)

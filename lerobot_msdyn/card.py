@@ -9,10 +9,13 @@ import yaml
 from lerobot.datasets.io_utils import load_info
 from lerobot.datasets.utils import create_lerobot_dataset_card
 
+from lerobot_msdyn.checks import regular_file
+from lerobot_msdyn.errors import DatasetError
 from lerobot_msdyn.files import write_whole
 from lerobot_msdyn.provenance import RECIPE, SOURCE_VARIANT, read_provenance
 
 CARD = "README.md"
+MAX_CARD_BYTES = 1 << 20
 TAGS = ["synthetic", "novel-view", "lerobot_msdyn"]
 DESCRIPTION = """\
 **{rendered} of the {episodes} episodes of this dataset are synthetic.** Their pictures were not recorded: they were
@@ -81,10 +84,13 @@ def write_card(root: Path, repo_id: str, licence: str | None = None) -> None:
 
 
 def licence_of(root: Path) -> str | None:
-    """The licence that a dataset's card names; None if it has no card, or that names none."""
+    """The licence that a dataset's card names; None if it has no card that can be read, or that names none."""
     try:
-        _, head, _ = (root / CARD).read_text(encoding="utf-8").split("---\n", 2)
+        path = regular_file(root, CARD)
+        if path.stat().st_size > MAX_CARD_BYTES:
+            return None
+        _, head, _ = path.read_text(encoding="utf-8").split("---\n", 2)
         found = yaml.safe_load(head).get("license")
-    except (OSError, ValueError, AttributeError, yaml.YAMLError):
+    except (OSError, ValueError, AttributeError, RecursionError, yaml.YAMLError, DatasetError):
         return None
     return found if isinstance(found, str) else None

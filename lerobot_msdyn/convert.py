@@ -40,15 +40,15 @@ def converted_copy(repo_id: str, root: Path, folder: Path) -> Path:
                 target = copy / path.relative_to(root)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(regular_file(root, path.relative_to(root)), target)
-    level = logging.getLogger().level
-    logging.getLogger().setLevel(logging.WARNING)
+    level = logging.root.manager.disable
+    logging.disable(logging.WARNING)  # LeRobot tells about every field that only the old version had
     try:
         with temporary_files_in(folder):
             convert_dataset(repo_id, root=copy, push_to_hub=False)
     except Exception as error:  # several libraries read the files, each with errors of its own
         raise DatasetError(f"{root} cannot be converted by LeRobot's script ({first_line(error)})") from error
     finally:
-        logging.getLogger().setLevel(level)
+        logging.disable(level)
     copy.rename(done)
     shutil.rmtree(copy.parent)
     return done

@@ -1,6 +1,5 @@
 """Metadata that lies: named in one line, or harmless."""
 
-import copy
 import json
 import os
 import shutil
@@ -15,7 +14,8 @@ from hypothesis import strategies as st
 
 from lerobot_msdyn.checks import check_metadata, inside, picture_size, template_problem
 from lerobot_msdyn.episode import open_source
-from lerobot_msdyn.errors import DatasetError
+from lerobot_msdyn.errors import DatasetError, EpisodeError
+from lerobot_msdyn.rows import read_rows
 
 FRONT = "observation.images.front"
 
@@ -166,18 +166,23 @@ json_values = st.recursive(
 )
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(data=st.data())
-def test_any_change_is_refused_in_one_line_or_harmless(desk: Path, root: Path, data: st.DataObject) -> None:
-    """Whatever one value of info.json becomes, what is accepted names files inside the dataset only."""
-    original = json.loads((desk / "meta" / "info.json").read_text())
-    content = copy.deepcopy(original)
-    *parents, last = data.draw(st.sampled_from(places(original)))
-    target = content
-    for key in parents:
-        target = target[key]
-    target[last] = data.draw(json_values | st.sampled_from(["../x", "/x", "{chunk_index.real}", "{file_index:9999d}"]))
-    (root / "meta" / "info.json").write_text(json.dumps(content))
+@pytest.fixture(params=["recorded here", "g1_v30"])
+def original(request: pytest.FixtureRequest) -> Path:
+    """A dataset whose metadata LeRobot wrote."""
+    if request.param == "g1_v30":
+        return request.getfixturevalue("shared_data") / "real" / "g1_v30"
+    return request.getfixturevalue("desk")
+
+
+@pytest.fixture
+def copied(original: Path, tmp_path: Path) -> Path:
+    """A copy of its metadata that can be written to."""
+    shutil.copytree(original / "meta", tmp_path / "copied" / "meta", copy_function=shutil.copyfile)
+    return tmp_path / "copied"
+
+
+def assert_refused_or_harmless(root: Path) -> None:
+    """What is accepted names files inside the dataset only; what is not is refused in one line."""
     try:
         source = open_source("local/ds", root)
     except DatasetError as error:
@@ -185,6 +190,53 @@ def test_any_change_is_refused_in_one_line_or_harmless(desk: Path, root: Path, d
         assert "\n" not in said
         return
     for index in range(source.total_episodes):
-        paths = [source.get_data_file_path(index)]
-        paths += [source.get_video_file_path(index, key) for key in source.video_keys]
-        assert all((root / path).resolve().is_relative_to(root) for path in paths)
+        with pytest.raises(EpisodeError) as caught:  # there is no data/
+            read_rows(source, index)
+        said = str(caught.value)
+        assert "\n" not in said
+        if "meta/episodes says that" not in said:
+            paths = [source.get_data_file_path(index)]
+            paths += [source.get_video_file_path(index, key) for key in source.video_keys]
+            assert all((root / path).resolve().is_relative_to(root) for path in paths)
+
+
+many = settings(
+    deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.differing_executors]
+)
+
+
+@settings(many, max_examples=100)
+@given(data=st.data())
+def test_any_change_of_info_is_refused_or_harmless(original: Path, copied: Path, data: st.DataObject) -> None:
+    content = json.loads((original / "meta" / "info.json").read_text())
+    *parents, last = data.draw(st.sampled_from(places(content)))
+    target = content
+    for key in parents:
+        target = target[key]
+    target[last] = data.draw(json_values | st.sampled_from(["../x", "/x", "{chunk_index.real}", "{file_index:9999d}"]))
+    (copied / "meta" / "info.json").write_text(json.dumps(content))
+    assert_refused_or_harmless(copied)
+
+
+cells = st.none() | st.booleans() | st.integers(-(2**63), 2**63 - 1) | st.floats() | st.text(max_size=20)
+
+
+@settings(many, max_examples=100)
+@given(data=st.data())
+def test_any_change_of_a_table_is_refused_or_harmless(original: Path, copied: Path, data: st.DataObject) -> None:
+    """A cell or a whole column of the tables of tasks and episodes becomes something else."""
+    names = sorted(path.relative_to(original) for path in (original / "meta").rglob("*.parquet"))
+    name = data.draw(st.sampled_from(names))
+    table = pq.read_table(original / name)
+    column = data.draw(st.sampled_from([key for key in table.column_names if not key.startswith("stats/")]))
+    values = table[column].to_pylist()
+    chosen = data.draw(st.sampled_from([slice(0, 1), slice(len(values) - 1, None), slice(None)]))
+    new = data.draw(cells | st.lists(cells, max_size=2))
+    values[chosen] = [new] * len(values[chosen])
+    try:
+        array = pa.array(values)
+    except (pa.ArrowException, TypeError, ValueError, OverflowError):
+        array = pa.array([str(value) for value in values])
+    pq.write_table(table.set_column(table.column_names.index(column), column, array), copied / name)
+    assert_refused_or_harmless(copied)
+    shutil.copyfile(original / name, copied / name)

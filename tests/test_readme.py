@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from tiny_act import SMALL_ACT
 
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.dataset import write_dataset
@@ -15,26 +16,6 @@ from lerobot_msdyn.synthetic.dataset import write_dataset
 PROJECT = Path(__file__).parent.parent
 IN_CI = {"make demo", "make test"}  # .ci/run
 BY_THE_WHEEL_TEST = {"pip install ."}
-# What keeps the training short and offline; the README's command is run with these behind it.
-SMALL_ACT = (
-    "--policy.device=cpu",
-    "--policy.pretrained_backbone_weights=null",
-    "--policy.chunk_size=4",
-    "--policy.n_action_steps=4",
-    "--policy.dim_model=32",
-    "--policy.n_heads=2",
-    "--policy.dim_feedforward=32",
-    "--policy.n_encoder_layers=1",
-    "--policy.n_vae_encoder_layers=1",
-    "--policy.latent_dim=4",
-    "--batch_size=2",
-    "--steps=2",
-    "--num_workers=0",
-    "--log_freq=1",
-    "--save_checkpoint=false",
-    "--wandb.enable=false",
-    "--dataset.video_backend=pyav",
-)
 
 
 def commands() -> list[str]:

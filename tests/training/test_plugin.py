@@ -8,27 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 from lerobot.datasets import LeRobotDataset
+from tiny_act import SMALL_ACT
 
 from lerobot_msdyn.training import MixedViews
 
 FRONT = "observation.images.front"
 PLUGIN = "--dataset.discover_packages_path=lerobot_msdyn.training.plugin"
-SMALL_ACT = (
-    "--policy.device=cpu",
-    "--policy.pretrained_backbone_weights=null",
-    "--policy.chunk_size=4",
-    "--policy.n_action_steps=4",
-    "--policy.dim_model=32",
-    "--policy.n_heads=2",
-    "--policy.dim_feedforward=32",
-    "--policy.n_encoder_layers=1",
-    "--policy.n_vae_encoder_layers=1",
-    "--policy.latent_dim=4",
-    "--batch_size=2",
-    "--steps=2",
-    "--save_checkpoint=false",
-    "--dataset.video_backend=pyav",
-)
 # A second plugin, which keeps every batch that the training loop is given.
 SPY = """
 import atexit, os, torch
