@@ -5,7 +5,7 @@ shrunk along its own path by a factor.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -214,3 +214,20 @@ def described(amounts: Float[Tensor, "t n"], view: Viewpoint) -> dict[str, float
             name, value = (f"{name}_m", value) if view.metric else (f"{name}_rel", value / view.distance)
         found[name] = value
     return found
+
+
+def units_of_shifts(drawn: Sequence[Mapping[str, Mapping[str, float]]]) -> str:
+    """A line that says in which unit cameras were shifted; empty if none was. `drawn`: per episode and camera."""
+    cameras: dict[str, set[str]] = {"_m": set(), "_rel": set()}
+    for episode in drawn:
+        for camera, amounts in episode.items():
+            for ending, found in cameras.items():
+                if any(name.startswith("shift_") and name.endswith(ending) for name in amounts):
+                    found.add(camera)
+    names = {ending: ", ".join(sorted(found)) for ending, found in cameras.items()}
+    said = [
+        f"{text} ({names[ending]})"
+        for ending, text in (("_m", "metres"), ("_rel", "shares of the look-at distance, as depth has no true scale"))
+        if names[ending]
+    ]
+    return f"shifts are {' and '.join(said)}\n" if said else ""
