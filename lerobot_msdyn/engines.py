@@ -10,7 +10,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 from lerobot_msdyn.config import AugmentConfig
 from lerobot_msdyn.episode import depth_key_of
 from lerobot_msdyn.errors import ConfigError, EpisodeError, MsdynError
-from lerobot_msdyn.estimate import measure_speeds, predicted_seconds
+from lerobot_msdyn.estimate import measure_speeds, predicted_scene_bytes, predicted_seconds
 from lerobot_msdyn.pipeline import augment_episode
 from lerobot_msdyn.sharing import shared_backgrounds
 from lerobot_msdyn.video import quiet_encoders
@@ -65,13 +65,16 @@ def plan(source: LeRobotDatasetMetadata, episodes: list[int], cameras: list[str]
     copies = config.variants + int(config.include_source)
     size = sum(file.stat().st_size for file in source.root.rglob("*") if file.is_file())
     disk = size * frames * copies / max(source.total_frames, 1)
-    seconds = predicted_seconds(measure_speeds(source, episodes[0], cameras, config), source, episodes, config)
+    speeds = measure_speeds(source, episodes[0], cameras, config)
+    seconds = predicted_seconds(speeds, source, episodes, config)
+    scenes = predicted_scene_bytes(speeds, source, episodes, config) if config.save_scenes else 0.0
+    with_scenes = f", {scenes / 1e6:.0f} MB of it saved scenes" if scenes else ""
     return (
         f"{source.repo_id}: {len(episodes)} episodes, {frames} frames; re-rendering {', '.join(cameras)}\n"
         f"{config.variants} new per episode: {len(episodes) * copies} episodes, {frames * copies} frames, "
         f"{frames * config.variants * len(cameras)} new pictures\n"
-        f"about {disk / 1e6:.0f} MB on disk, and about {seconds / 60:.1f} minutes on this machine, "
-        "judging by a few frames and steps\n"
+        f"about {(disk + scenes) / 1e6:.0f} MB on disk{with_scenes}, and about {seconds / 60:.1f} minutes "
+        "on this machine, judging by a few frames and steps\n"
     )
 
 

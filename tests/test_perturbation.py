@@ -182,8 +182,9 @@ def test_look_at_distance_is_that_of_the_middle() -> None:
 
 
 def test_the_summary_says_in_which_unit_cameras_were_shifted() -> None:
+    metres = described(amounts(OrbitConfig()), viewpoint())
     drawn = [
-        {"front": described(amounts(OrbitConfig()), viewpoint()), "side": described(amounts(OrbitConfig()), viewpoint())},
+        {"front": metres, "side": metres},
         {"top": described(amounts(OrbitConfig(), metric=False), viewpoint(metric=False))},
     ]
     said = "metres (front, side) and shares of the look-at distance, as depth has no true scale (top)"

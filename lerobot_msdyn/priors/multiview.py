@@ -49,7 +49,8 @@ def why_no_partner(view: View, others: Sequence[View]) -> str:
     if not apart:
         return "the other calibrated cameras stand at the same place"
     nearest = min(_angle_deg(view.camera, camera) for camera in apart)
-    return f"the nearest other calibrated camera looks {nearest:.0f} degrees elsewhere (less than {_MAX_ANGLE_DEG:g} needed)"
+    allowed = f"less than {_MAX_ANGLE_DEG:g} needed"
+    return f"the nearest other calibrated camera looks {nearest:.0f} degrees elsewhere ({allowed})"
 
 
 def _is_calibrated(camera: CameraTrack) -> bool:
