@@ -15,7 +15,7 @@ from lerobot_msdyn.episode import View, open_source, read_episode, select_camera
 from lerobot_msdyn.priors import Priors, estimate_priors
 from lerobot_msdyn.priors.exchange import from_priors, write_exchange
 
-CORRUPTIONS = ("none", "wrong_depth", "too_few_steps", "broken_masks", "lost_tracks")
+CORRUPTIONS = ("none", "wrong_depth", "wrong_sensor", "too_few_steps", "broken_masks", "lost_tracks")
 FEW_STEPS = 1
 BIAS, FRAME_BIAS, FRAME_SCALE = 0.06, 0.01, 0.02  # standard deviations of the logarithm of wrong depth
 MASKS_LOST = 0.4  # share of the frames whose mask is empty; the others' are shifted
@@ -54,6 +54,9 @@ def corrupted(view: View, recipe: Recipe, corruption: str, priors: Priors, folde
         assert view.depth is not None
         priors = replace(priors, depth=torch.from_numpy(wrong_depth(view.depth.numpy(), rng)))
         known["depth"] = str(path)
+    elif corruption == "wrong_sensor":  # the same depth, but as if it had been recorded: nothing says that it is poor
+        assert view.depth is not None
+        view = replace(view, depth=torch.from_numpy(wrong_depth(view.depth.numpy(), rng)))
     elif corruption == "too_few_steps":
         recipe = replace(recipe, fit=replace(recipe.fit, steps=FEW_STEPS))
     elif corruption == "broken_masks":

@@ -3,7 +3,7 @@
     python benchmarks/gate.py --sim FOLDER [--scenes A,B] [--json FILE]
 
 FOLDER holds one folder per scene with dataset_depth/ and gt/ (docs/evaluate.md). Every scene is reconstructed from
-good priors and from four kinds of bad ones (corruptions.py); every reconstruction is drawn from all held-out cameras.
+good priors and in five bad ways (corruptions.py); every reconstruction is drawn from all held-out cameras.
 One case is one scene, corruption and camera. Printed, and written to FILE:
 
     cases                 how many

@@ -99,6 +99,7 @@ def augment(
     """Run the job that the command line described and say how it went; returns the exit code."""
     from lerobot_msdyn.engines import run_local
     from lerobot_msdyn.identity import describe_run, recipe_text, source_files
+    from lerobot_msdyn.perturbation import units_of_shifts
     from lerobot_msdyn.provenance import SOURCE_VARIANT
     from lerobot_msdyn.report.build import write_report
     from lerobot_msdyn.sharing import background_episodes
@@ -126,6 +127,7 @@ def augment(
     return _say_skipped(
         f"{len(episodes) - len(failures)} of {len(episodes)} episodes, {rendered} new ones "
         f"({config.variants} per episode, {', '.join(cameras)}), {time.perf_counter() - start:.0f} s\n"
+        f"{units_of_shifts([episode.provenance.perturbation for episode in made])}"
         f"written to {new_root}\n"
         f"look at {new_root / 'report.html'}\n"
         f"train:  lerobot-train --dataset.repo_id={new_repo_id} --dataset.root={new_root} --policy.type=act "

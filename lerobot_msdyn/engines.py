@@ -15,7 +15,7 @@ from lerobot_msdyn.config import AugmentConfig
 from lerobot_msdyn.devices import chosen_device
 from lerobot_msdyn.episode import depth_key_of
 from lerobot_msdyn.errors import EpisodeError, MsdynError
-from lerobot_msdyn.estimate import measure_speeds, predicted_seconds
+from lerobot_msdyn.estimate import measure_speeds, predicted_scene_bytes, predicted_seconds
 from lerobot_msdyn.pipeline import augment_episode
 from lerobot_msdyn.video import quiet_encoders
 from lerobot_msdyn.workers import Work, Workers, threads_of_one, workers_for
@@ -116,12 +116,14 @@ def plan(source: LeRobotDatasetMetadata, episodes: list[int], cameras: list[str]
     with threads_of_one(count):
         speeds = measure_speeds(source, episodes[0], cameras, config)
     seconds = predicted_seconds(speeds, source, episodes, config, count)
+    scenes = predicted_scene_bytes(speeds, source, episodes, config) if config.save_scenes else 0.0
+    with_scenes = f", {scenes / 1e6:.0f} MB of it saved scenes" if scenes else ""
     return (
         f"{source.repo_id}: {len(episodes)} episodes, {frames} frames; re-rendering {', '.join(cameras)}\n"
         f"{config.variants} new per episode: {len(episodes) * copies} episodes, {frames * copies} frames, "
         f"{frames * config.variants * len(cameras)} new pictures\n"
-        f"about {disk / 1e6:.0f} MB on disk, and about {seconds / 60:.1f} minutes on this machine, "
-        f"by {count} {'process' if count == 1 else 'processes'}, judging by a few frames and steps\n"
+        f"about {(disk + scenes) / 1e6:.0f} MB on disk{with_scenes}, and about {seconds / 60:.1f} minutes "
+        f"on this machine, by {count} {'process' if count == 1 else 'processes'}, judging by a few frames and steps\n"
     )
 
 

@@ -13,12 +13,14 @@ from lerobot_msdyn.devices import chosen_device
 from lerobot_msdyn.episode import View, read_episode
 from lerobot_msdyn.pictures import stage_pictures
 from lerobot_msdyn.pipeline import FURTHER_STEPS, by_feature, reconstruct
+from lerobot_msdyn.scene import DynamicScene
 from lerobot_msdyn.sharing import looked_at
 from lerobot_msdyn.views import new_pictures, on_device
 
 PROBE_FRAMES = 24
 PROBE_STEPS = 14
 MASKS_SHARE = 0.3  # of the time of priors and initial scene
+GROWING = ("overlay.", "shading.field", "shading.moving")  # tensors of a scene with a part for every frame
 WARM_UP_STEPS = 4  # the first ones compile, and fill caches
 
 
@@ -30,6 +32,8 @@ class Speeds:
     prepare_s: float  # per frame: priors and initial scene
     step_s: float  # per step of the fit
     render_s: float  # per new frame, encoded
+    scene_bytes: float = 0.0  # of the saved scenes of an episode, however long ...
+    frame_bytes: float = 0.0  # ... and for each of its frames
 
 
 def measure_speeds(source: LeRobotDatasetMetadata, index: int, cameras: list[str], recipe: Recipe) -> Speeds:
@@ -51,7 +55,7 @@ def measure_speeds(source: LeRobotDatasetMetadata, index: int, cameras: list[str
     views = episode.views
     if not recipe.needs_whole_videos:
         views = {key: _middle(view) for key, view in views.items()}
-    prepare_s = step_s = render_s = 0.0
+    prepare_s = step_s = render_s = scene_bytes = frame_bytes = 0.0
     for key, part in views.items():
         ticks: list[float] = []
 
@@ -66,13 +70,22 @@ def measure_speeds(source: LeRobotDatasetMetadata, index: int, cameras: list[str
             after - before for before, after in zip(ticks[WARM_UP_STEPS:], ticks[WARM_UP_STEPS + 1 :], strict=False)
         ]
         step_s += statistics.median(steps)
+        once, each = _saved_sizes(scene.results[0].scene)
+        scene_bytes, frame_bytes = scene_bytes + once, frame_bytes + each
         with tempfile.TemporaryDirectory() as folder:
             start = time.perf_counter()
             drawn = on_device(scene, chosen_device(recipe.device))
             pictures = by_feature(source, {key: new_pictures(drawn, part.camera)})
             stage_pictures(source, Path(folder), pictures, len(part.rgb))
             render_s += (time.perf_counter() - start) / len(part.rgb)
-    return Speeds(read_s, prepare_s, step_s, render_s)
+    return Speeds(read_s, prepare_s, step_s, render_s, scene_bytes, frame_bytes)
+
+
+def predicted_scene_bytes(speeds: Speeds, source: LeRobotDatasetMetadata, episodes: list[int], recipe: Recipe) -> float:
+    """Disk for the saved scenes of a whole run; a window of a long episode has a scene of its own."""
+    lengths = [int(source.episodes[index]["length"]) for index in episodes]
+    windows = sum(-(-frames // recipe.fit.window_frames) for frames in lengths)
+    return windows * speeds.scene_bytes + sum(lengths) * speeds.frame_bytes
 
 
 def predicted_seconds(
@@ -94,6 +107,13 @@ def predicted_seconds(
         one_s = frames * (speeds.read_s + speeds.prepare_s + recipe.variants * speeds.render_s)
         busy_s[busy_s.index(min(busy_s))] += one_s + windows * steps * speeds.step_s
     return background_s + max(busy_s)
+
+
+def _saved_sizes(scene: DynamicScene) -> tuple[float, float]:
+    """Bytes of a scene that do not grow with its length, and those of each frame."""
+    sizes = {name: tensor.nbytes for name, tensor in scene.tensors().items()}
+    growing = sum(size for name, size in sizes.items() if name.startswith(GROWING))
+    return float(sum(sizes.values()) - growing), growing / scene.frames
 
 
 def _middle(view: View) -> View:

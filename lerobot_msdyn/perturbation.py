@@ -5,7 +5,7 @@ shrunk along its own path by a factor.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -149,6 +149,8 @@ def offsets(amounts: Float[Tensor, "t n"], distance: float) -> Float[Tensor, "t 
     """(Recorded camera from new camera): an orbit about the point at `distance` (m), then a shift, then a turn."""
     orbit = torch.stack([orbit_offset(float(row[0]), float(row[1]), distance) for row in amounts])
     orbit[:, :3, 3] += amounts[:, SHIFT]
+    if not bool(amounts[:, TURN].any()):
+        return orbit
     return orbit @ se3(axis_angle_to_matrix(torch.deg2rad(amounts[:, TURN])), torch.zeros(len(amounts), 3))
 
 
@@ -159,11 +161,17 @@ def orbit_offset(azimuth_deg: float, elevation_deg: float, distance: float) -> F
     coordinates to the recorded camera's.
     """
     # The camera's y axis points down: turning the camera to its right about the point is a negative turn about it.
-    azimuth = axis_angle_to_matrix(torch.tensor([0.0, -math.radians(azimuth_deg), 0.0]))
-    elevation = axis_angle_to_matrix(torch.tensor([-math.radians(elevation_deg), 0.0, 0.0]))
-    rotation = azimuth @ elevation
-    target = torch.tensor([0.0, 0.0, distance])
-    return se3(rotation, target - rotation @ target)
+    a, e = -math.radians(azimuth_deg), -math.radians(elevation_deg)
+    sin_a, cos_a, sin_e, cos_e = math.sin(a), math.cos(a), math.sin(e), math.cos(e)
+    ahead = (sin_a * cos_e, -sin_e, cos_a * cos_e)  # the new optical axis
+    return torch.tensor(
+        [
+            [cos_a, sin_a * sin_e, ahead[0], -distance * ahead[0]],
+            [0.0, cos_e, ahead[1], -distance * ahead[1]],
+            [-sin_a, cos_a * sin_e, ahead[2], distance - distance * ahead[2]],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
 
 
 def share_a_world(views: Mapping[str, Viewpoint]) -> bool:
@@ -214,3 +222,20 @@ def described(amounts: Float[Tensor, "t n"], view: Viewpoint) -> dict[str, float
             name, value = (f"{name}_m", value) if view.metric else (f"{name}_rel", value / view.distance)
         found[name] = value
     return found
+
+
+def units_of_shifts(drawn: Sequence[Mapping[str, Mapping[str, float]]]) -> str:
+    """A line that says in which unit cameras were shifted; empty if none was. `drawn`: per episode and camera."""
+    cameras: dict[str, set[str]] = {"_m": set(), "_rel": set()}
+    for episode in drawn:
+        for camera, amounts in episode.items():
+            for ending, found in cameras.items():
+                if any(name.startswith("shift_") and name.endswith(ending) for name in amounts):
+                    found.add(camera)
+    names = {ending: ", ".join(sorted(found)) for ending, found in cameras.items()}
+    said = [
+        f"{text} ({names[ending]})"
+        for ending, text in (("_m", "metres"), ("_rel", "shares of the look-at distance, as depth has no true scale"))
+        if names[ending]
+    ]
+    return f"shifts are {' and '.join(said)}\n" if said else ""

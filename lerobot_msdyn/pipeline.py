@@ -291,10 +291,10 @@ def _fit_window(
             progress=lambda done: progress(done / steps),
         )
         seen = evidence_of(result.scene, view.camera, empty)
-        said = witness(result.scene, view, priors, result.held_out)  # of frames that an overlay would show as recorded
         if settings.overlay:
             overlay = unexplained(result.scene, view, priors, enlarged=enlarged)
             result = replace(result, scene=replace(result.scene, overlay=overlay))
+        said = witness(result.scene, view, priors, result.held_out)
         result, seen = to_device((result, seen), "cpu")
     return result, priors, distance, seen, said
 

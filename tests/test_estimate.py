@@ -6,7 +6,7 @@ import pytest
 
 from lerobot_msdyn.config import Recipe
 from lerobot_msdyn.episode import open_source
-from lerobot_msdyn.estimate import Speeds, measure_speeds, predicted_seconds
+from lerobot_msdyn.estimate import Speeds, measure_speeds, predicted_scene_bytes, predicted_seconds
 
 
 def test_every_part_is_timed(desk: Path) -> None:
@@ -16,6 +16,8 @@ def test_every_part_is_timed(desk: Path) -> None:
     assert 0 < speeds.prepare_s < 5
     assert 0 < speeds.step_s < 1
     assert 0 < speeds.render_s < 5
+    assert 3_000 * 56 < speeds.scene_bytes < 1e6  # about one Gaussian of 56 bytes per pixel of 64x48, and moving ones
+    assert 0 < speeds.frame_bytes < 64 * 48 * 40
 
 
 def test_parts_are_added_up(desk: Path) -> None:
@@ -31,3 +33,10 @@ def test_parts_are_added_up(desk: Path) -> None:
     assert two == pytest.approx(
         (1 + 0.5) * 3 * 12 * 1 + 0.5 * 12 * 0.3 * 2 + 50 * 3 + 12 * (1 + 2 + 2 * 4) + 2 * 60 * 3
     )
+
+
+def test_saved_scenes_need_disk(desk: Path) -> None:
+    source, recipe = open_source("local/desk", desk), Recipe()
+    recipe.fit.window_frames = 6
+    speeds = Speeds(1.0, 2.0, 3.0, 4.0, scene_bytes=1000.0, frame_bytes=10.0)
+    assert predicted_scene_bytes(speeds, source, [0, 2], recipe) == 2 * 2 * 1000 + 2 * 12 * 10

@@ -31,6 +31,7 @@ from lerobot_msdyn.perturbation import (
     moved,
     offsets,
     orbit_offset,
+    units_of_shifts,
 )
 
 FRAMES, DISTANCE = 5, 0.7
@@ -178,3 +179,15 @@ def test_look_at_distance_is_that_of_the_middle() -> None:
     depth[3, 3] = 0
     assert look_at_distance(depth) == pytest.approx(0.7)
     assert look_at_distance(torch.zeros(8, 8)) == 1.0
+
+
+def test_the_summary_says_in_which_unit_cameras_were_shifted() -> None:
+    metres = described(amounts(OrbitConfig()), viewpoint())
+    drawn = [
+        {"front": metres, "side": metres},
+        {"top": described(amounts(OrbitConfig(), metric=False), viewpoint(metric=False))},
+    ]
+    said = "metres (front, side) and shares of the look-at distance, as depth has no true scale (top)"
+    assert units_of_shifts(drawn) == f"shifts are {said}\n"
+    assert units_of_shifts(drawn[:1]) == "shifts are metres (front, side)\n"
+    assert units_of_shifts([{}, {"front": described(amounts(RotationConfig()), viewpoint())}]) == ""

@@ -36,6 +36,23 @@ def usable_partners(view: View, others: Sequence[View]) -> list[View]:
     ]
 
 
+def why_no_partner(view: View, others: Sequence[View]) -> str:
+    """Why `usable_partners` finds none, in words."""
+    if not others:
+        return "no other camera of the episode is read with this one"
+    if not _is_calibrated(view.camera):
+        return "this camera is not calibrated"
+    known = [other.camera for other in others if _is_calibrated(other.camera)]
+    if not known:
+        return "no other camera is calibrated"
+    apart = [camera for camera in known if _baseline(view.camera, camera) > _MIN_BASELINE_M]
+    if not apart:
+        return "the other calibrated cameras stand at the same place"
+    nearest = min(_angle_deg(view.camera, camera) for camera in apart)
+    allowed = f"less than {_MAX_ANGLE_DEG:g} needed"
+    return f"the nearest other calibrated camera looks {nearest:.0f} degrees elsewhere ({allowed})"
+
+
 def _is_calibrated(camera: CameraTrack) -> bool:
     return camera.origin in ("calibration", "exchange") and camera.is_static
 

@@ -16,7 +16,7 @@ from lerobot_msdyn.priors.depth import table_plane_depth
 from lerobot_msdyn.priors.depth_anything import predict_depth
 from lerobot_msdyn.priors.edges import clean_recorded_depth, without_flying_pixels
 from lerobot_msdyn.priors.hub import LocalModel, demand_model, find_model, has_library
-from lerobot_msdyn.priors.multiview import multiview_depth, usable_partners
+from lerobot_msdyn.priors.multiview import multiview_depth, usable_partners, why_no_partner
 from lerobot_msdyn.priors.provide_masks import file_origin
 from lerobot_msdyn.priors.request import FILE, Candidate, Request, first_that_works
 from lerobot_msdyn.priors.types import Origin
@@ -71,7 +71,7 @@ def _candidates(request: Request, instances: UInt8[Tensor, "t h w"]) -> list[Can
         found.append(Candidate("stereo", why, functools.partial(_stereo, request, instances)))
         missing += ", the other cameras do not help"
     else:
-        missing += ", no other calibrated camera"
+        missing += f", {why_no_partner(request.view, request.others)}"
     found.append(Candidate("plane", missing, functools.partial(_plane, request, instances)))
     return found
 
@@ -100,7 +100,7 @@ def _stereo(request: Request, instances: UInt8[Tensor, "t h w"], why: str) -> Fo
     partners = usable_partners(request.view, request.others)
     if not partners:
         raise PriorError(
-            "priors.depth is 'stereo', but no second camera with K, R and t sees what this one sees; "
+            f"priors.depth is 'stereo', but {why_no_partner(request.view, request.others)}; "
             "name two or more cameras of the episode in --camera.calibration and in --cameras"
         )
     views = [request.view, *partners]

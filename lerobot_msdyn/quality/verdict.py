@@ -45,8 +45,9 @@ class Scores:
 
     expected_db: float  # the episode's score: expected peak signal-to-noise ratio over all judged frames
     causes: dict[str, float]  # share of the expected error by cause, 0..1
-    held_out_db: float  # of the recorded view, on frames that the fit never saw (if held_out)
+    held_out_db: float  # of the recorded view, on frames that the fit never saw (if held_out), without overlay
     held_out_ssim: float
+    moving_db: float  # the same over what moves: low where motion is not understood, however little of it there is
     held_out: bool  # whether there were such frames
     unseen: float  # mean over the frames, 0..1
     angle_deg: float
@@ -99,8 +100,9 @@ def judge(windows: Sequence[Witnessed], camera: CameraTrack) -> Scores:
     return Scores(
         total.psnr_db,
         total.shares,
-        decibels(float(torch.cat([witness.error for witness in witnesses]).mean())),
+        decibels(float(torch.cat([witness.fitted_error for witness in witnesses]).mean())),
         float(np.mean([witness.ssim for witness in witnesses])),
+        decibels(float(np.mean([witness.moving_error for witness in witnesses]))),
         all(witness.held_out for witness in witnesses),
         float(np.mean([frame.unseen for frame in frames])),
         float(np.mean([frame.angle_deg for frame in frames])),

@@ -1,10 +1,11 @@
 """How well a fitted scene explains its own video, at a few frames that the fit never saw: all there is to judge it by.
 
 No ground truth is used. Brightness over time, masks and tracks were measured on these frames as well; the Gaussians
-were not fitted to them.
+were not fitted to them. New views are drawn with the overlay, which every frame has of itself: so what is wrong with
+them is judged with it, and what the scene alone makes of frames that it never saw is said beside.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import kornia
@@ -25,6 +26,7 @@ WITNESSES = 3  # frames that are looked at where none was held out
 STILL_PX = 5  # side of the square around a pixel in which nothing may move for it to stand still
 TRACKED = 400  # points, at most, of which the residual is measured
 SSIM_WINDOW = 11
+DEPTH_FRAMES = 12  # at which the depth of what stands still is compared with itself
 
 
 @dataclass(frozen=True)
@@ -36,17 +38,14 @@ class Witness:
     camera: CameraTrack
     recorded: Float[Tensor, "t h w 3"]  # 0..1
     depth: Float[Tensor, "t h w"]  # m, prior; 0 = unknown
-    drawn_depth: Float[Tensor, "t h w"]  # m, of the scene
-    error: Float[Tensor, " t"]  # mean square colour error, 0..1
-    ssim: float
+    drawn_depth: Float[Tensor, "t h w"]  # m, of the scene with its overlay
+    error: Float[Tensor, " t"]  # mean square colour error of the scene with its overlay, 0..1
+    fitted_error: Float[Tensor, " t"]  # the same without the overlay
+    moving_error: float  # the same over what moves; 0 where nothing does
+    ssim: float  # without the overlay
     track_px: float  # median distance of the tracks to the motion's projection
     flicker: float  # mean absolute difference of what stands still to the next frame, 0..1
-    depth_error: float  # relative, of the provider of depth
-
-    @property
-    def psnr_db(self) -> float:
-        """Peak signal-to-noise ratio of the drawn against the recorded frames."""
-        return decibels(float(self.error.mean()))
+    depth_error: float  # relative: what the provider of depth is known for, or more where its depth is less steady
 
 
 def decibels(error: float) -> float:
@@ -56,7 +55,10 @@ def decibels(error: float) -> float:
 
 @torch.no_grad()
 def witness(scene: DynamicScene, view: View, priors: Priors, held_out: Int[Tensor, " n"]) -> Witness:
-    """What a scene says of frames that it was not fitted to; of others where `held_out` is empty. It is on the host."""
+    """What a scene, with its overlay, says of frames that it was not fitted to; of others where `held_out` is empty.
+
+    It is on the host.
+    """
     total = len(view.rgb)
     frames = held_out if len(held_out) else torch.linspace(0, total - 1, min(WITNESSES + 2, total)).round().long()
     if len(held_out) == 0 and total > WITNESSES + 1:
@@ -64,7 +66,8 @@ def witness(scene: DynamicScene, view: View, priors: Priors, held_out: Int[Tenso
     camera = view.camera.select(frames)
     drawn = to_device(draw(scene, camera, frames), "cpu")
     recorded = view.rgb[frames].float() / 255
-    pictures = drawn.rgb.clamp(0, 1)
+    pictures = draw(replace(scene, overlay=None), camera, frames).rgb.clamp(0, 1).cpu()
+    wrong, moving = (pictures - recorded).square().mean(-1), priors.instances[frames] > 0
     following = (frames + 1).clamp(max=total - 1)
     still = stands_still(priors.instances[frames] > 0) & stands_still(priors.instances[following] > 0)
     return Witness(
@@ -74,12 +77,30 @@ def witness(scene: DynamicScene, view: View, priors: Priors, held_out: Int[Tenso
         recorded,
         priors.depth[frames],
         drawn.depth,
-        (pictures - recorded).square().mean((1, 2, 3)),
+        (drawn.rgb.clamp(0, 1) - recorded).square().mean((1, 2, 3)),
+        wrong.mean((1, 2)),
+        float(wrong[moving].mean()) if bool(moving.any()) else 0.0,
         similarity(pictures, recorded),
         _track_residual(scene, view.camera, priors),
         flicker(recorded, view.rgb[following].float() / 255, still),
-        priors.depth_error,
+        max(priors.depth_error, unsteadiness(priors) if view.camera.is_static else 0.0),
     )
+
+
+def unsteadiness(priors: Priors) -> float:
+    """Relative standard deviation over time of the depth of what stands still before a fixed camera, at half of it.
+
+    It has one depth, so that this is what its provider errs by at least; errors that stay do not show.
+    """
+    frames = torch.linspace(0, len(priors.depth) - 1, min(DEPTH_FRAMES, len(priors.depth))).round().long()
+    depth = priors.depth[frames]
+    known = (depth > 0) & (priors.instances[frames] == 0)
+    count = known.sum(0)
+    logarithm = depth.clamp(min=1e-6).log() * known
+    mean = logarithm.sum(0) / count.clamp(min=1)
+    variance = ((logarithm - mean) * known).square().sum(0) / count.clamp(min=1)
+    often = count > len(frames) / 2
+    return float(variance[often].sqrt().median()) if bool(often.any()) else 0.0
 
 
 def similarity(one: Float[Tensor, "t h w 3"], other: Float[Tensor, "t h w 3"]) -> float:

@@ -53,6 +53,7 @@ NAMES = {
     "expected_db": ("expected quality", "{:.1f} dB"),
     "held_out_db": ("recorded view, held-out frames", "{:.1f} dB"),
     "held_out_ssim": ("the same, SSIM", "{:.3f}"),
+    "moving_db": ("the same, what moves", "{:.1f} dB"),
     "unseen": ("never seen", "{:.1%}"),
     "angle_deg": ("change of the line of sight", "{:.1f}°"),
     "track_px": ("tracks to motion", "{:.1f} px"),

@@ -11,7 +11,7 @@ from torch import Tensor
 from lerobot_msdyn.cameras import CameraTrack
 from lerobot_msdyn.coverage import HOLE_ALPHA
 from lerobot_msdyn.motion.bases import MotionLevel, level_affines
-from lerobot_msdyn.overlay import FramePatch
+from lerobot_msdyn.overlay import Overlay
 from lerobot_msdyn.render import rasterize
 from lerobot_msdyn.saved import SavedScene
 from lerobot_msdyn.scene import PATCH_OPACITY, DynamicScene
@@ -61,17 +61,19 @@ class LiveScene:
 
 
 class _LiveWindow:
-    """One window's Gaussians in buffers whose static part is written once."""
+    """One window's Gaussians in buffers whose static part is written once; behind them there is room for a patch."""
 
     def __init__(self, scene: DynamicScene) -> None:
         static, moving = scene.static, scene.moving
-        self._scene, self._static = scene, len(static)
+        self._scene, self._static, self._own = scene, len(static), len(static) + len(moving)
         self._static_rgb = static.rgb
-        self._scales = torch.cat((static.scales, moving.scales))
+        room = 0 if scene.overlay is None else int(scene.overlay.first.diff().max())
+        self._scales = torch.cat((static.scales, moving.scales, torch.zeros(room, 3)))
         self._opacities = torch.cat((static.opacity_logits, moving.opacity_logits)).sigmoid()
-        self._means = torch.cat((static.means, moving.means))
-        self._quats = torch.cat((static.quats, moving.quats))
-        self._rgb = torch.cat((static.rgb, moving.rgb))
+        self._means = torch.cat((static.means, moving.means, torch.zeros(room, 3)))
+        self._quats = torch.cat((static.quats, moving.quats, torch.zeros(room, 4)))
+        self._rgb = torch.cat((static.rgb, moving.rgb, torch.zeros(room, 3)))
+        self._shown = torch.cat((self._opacities, torch.full((room,), PATCH_OPACITY)))
         self._levels = [i for i, level in enumerate(scene.levels) if not _is_idle(level)]
         self._posable = all(isinstance(scene.levels[i], MotionLevel) for i in self._levels)
         if self._posable:
@@ -93,7 +95,15 @@ class _LiveWindow:
     @property
     def size_in_bytes(self) -> int:
         """Memory of the buffers."""
-        tensors = (self._static_rgb, self._scales, self._opacities, self._means, self._quats, self._rgb)
+        tensors = (
+            self._static_rgb,
+            self._scales,
+            self._opacities,
+            self._shown,
+            self._means,
+            self._quats,
+            self._rgb,
+        )
         return sum(tensor.nbytes for tensor in tensors)
 
     @torch.no_grad()
@@ -105,35 +115,41 @@ class _LiveWindow:
         shading = self._scene.shading
         if shading is not None:
             torch.mul(self._static_rgb, shading.static_gain(time)[0, :, None], out=self._rgb[: self._static])
-            self._rgb[self._static :] *= shading.moving_gain(time)[0, :, None]
-        drawn = (self._means, self._quats, self._scales, self._opacities, self._rgb)
-        if self._scene.overlay is not None:
-            drawn = self._overlaid(self._scene.overlay.patch(frame, len(self._means)))
+            self._rgb[self._static : self._own] *= shading.moving_gain(time)[0, :, None]
+        count = self._own if self._scene.overlay is None else self._put_patch(self._scene.overlay, frame)
         raster = rasterize(
-            *drawn,
+            self._means[:count],
+            self._quats[:count],
+            self._scales[:count],
+            self._shown[:count],
+            self._rgb[:count],
             camera.camera_from_world,
             camera.intrinsics,
             camera.width,
             camera.height,
+            near=self._scene.near,
         )
         planes = raster.features[0].permute(2, 0, 1)  # as they lie in memory
         rgb = planes.clamp(0, 1).mul_(255).round_().to(torch.uint8)
         return rgb.numpy(), raster.depth[0].numpy(), raster.alpha[0].numpy()
 
-    def _overlaid(self, patch: FramePatch) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """The buffers with a patch behind them; what it hides gets no opacity, which is faster than `patched`."""
-        opacities = torch.full((len(patch),), PATCH_OPACITY)
-        return (
-            torch.cat((self._means, patch.means)),
-            torch.cat((self._quats, patch.quats)),
-            torch.cat((self._scales, patch.log_scales.exp())),
-            torch.cat((self._opacities.masked_fill(patch.hidden, 0.0), opacities)),
-            torch.cat((self._rgb, patch.rgb)),
-        )
+    def _put_patch(self, overlay: Overlay, frame: int) -> int:
+        """Write a frame's patch behind the scene's own Gaussians, and hide those that it replaces; how many there are.
+
+        What is hidden gets no opacity, which is faster than taking it out.
+        """
+        rows = slice(int(overlay.first[frame]), int(overlay.first[frame + 1]))
+        place = slice(self._own, self._own + rows.stop - rows.start)
+        for buffer, values in ((self._means, overlay.means), (self._quats, overlay.quats), (self._rgb, overlay.rgb)):
+            buffer[place] = values[rows]
+        torch.exp(overlay.log_scales[rows].float(), out=self._scales[place])
+        shown = np.unpackbits(overlay.hidden[frame].numpy(), count=self._own) == 0
+        np.multiply(self._opacities.numpy(), shown, out=self._shown[: self._own].numpy())
+        return place.stop
 
     def _set_moving(self, time: Int[Tensor, " 1"], eye: Tensor) -> None:
         """Write positions, orientations and colours of the moving set at a time into the buffers."""
-        moving = slice(self._static, None)
+        moving = slice(self._static, self._own)
         if not self._posable:
             unlit = replace(self._scene, shading=None)
             snapshot = unlit.at(time, eye[None])

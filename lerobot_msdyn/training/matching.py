@@ -9,7 +9,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 
 from lerobot_msdyn import provenance, saved
 from lerobot_msdyn.cli import parse_config
-from lerobot_msdyn.config import AugmentConfig, PerturbationConfig, Recipe
+from lerobot_msdyn.config import AugmentConfig, Recipe
 from lerobot_msdyn.errors import DatasetError
 from lerobot_msdyn.saved import SavedScene
 from lerobot_msdyn.training.scene_cache import Scenes
@@ -27,12 +27,16 @@ def scenes_of(meta: LeRobotDatasetMetadata, episodes: list[int] | None, scenes: 
         MsdynError: the folder holds no saved scenes.
         DatasetError: the scenes are of other videos.
     """
+    wanted = range(meta.total_episodes) if episodes is None else episodes
     if isinstance(scenes, Mapping):
         known, sources = scenes, {episode: episode for episode in scenes}
     else:
         known = saved.list_scenes(scenes)
-        sources = _source_episodes(meta, scenes) or {episode: episode for episode in known}
-    wanted = range(meta.total_episodes) if episodes is None else episodes
+        sources = _source_episodes(meta, scenes)
+        if not sources:
+            _check_name(meta, scenes, known)
+            sources = {episode: episode for episode in known}
+        known = _without_dropped(meta, scenes, known)
     found = {episode: known[sources[episode]] for episode in wanted if sources.get(episode) in known}
     for episode, cameras in found.items():
         for camera, scene in cameras.items():
@@ -47,14 +51,14 @@ def scenes_of(meta: LeRobotDatasetMetadata, episodes: list[int] | None, scenes: 
     return found
 
 
-def perturbation_of(scenes: Path | Scenes) -> PerturbationConfig:
-    """The perturbation of the run that saved a folder of scenes; the default one for other scenes."""
+def recipe_of(scenes: Path | Scenes) -> Recipe:
+    """The recipe of the run that saved a folder of scenes; the default one for other scenes."""
     if isinstance(scenes, Mapping):
-        return Recipe().perturbation
-    path = _output_of(scenes) / provenance.FOLDER / "recipe.yaml"
+        return Recipe()
+    path = _output_of(scenes) / provenance.RECIPE
     if not path.is_file():
-        return Recipe().perturbation
-    return parse_config(AugmentConfig, ["--recipe", str(path)], {}, command="MixedViews").perturbation
+        return Recipe()
+    return parse_config(AugmentConfig, ["--recipe", str(path)], {}, command="MixedViews")
 
 
 def _output_of(folder: Path) -> Path:
@@ -71,6 +75,35 @@ def _source_episodes(meta: LeRobotDatasetMetadata, folder: Path) -> dict[int, in
         return {}
     rows = pq.read_table(table, columns=["episode_index", "source_episode"]).to_pylist()
     return {row["episode_index"]: row["source_episode"] for row in rows}
+
+
+def _check_name(meta: LeRobotDatasetMetadata, scenes: Path, known: Mapping[int, Mapping[str, Path]]) -> None:
+    """Whether the scenes are of the dataset by its name: what they show is not compared.
+
+    Raises:
+        DatasetError: they are of another one.
+    """
+    some = next(iter(next(iter(known.values())).values()))
+    made_of = saved.read_header(some)["source"]["repo_id"]
+    if made_of != meta.repo_id:
+        raise DatasetError(
+            f"{scenes}: the scenes are of {made_of}; expected {meta.repo_id}, the dataset that is wrapped; if they are "
+            "the same, open it by that name, or pass the scenes as a mapping (lerobot_msdyn.saved.list_scenes)"
+        )
+
+
+def _without_dropped(
+    meta: LeRobotDatasetMetadata, scenes: Path, known: Mapping[int, Mapping[str, Path]]
+) -> Mapping[int, Mapping[str, Path]]:
+    """The scenes of episodes of which the run kept a new view at least; says once which ones its gate refused."""
+    rows = provenance.read_provenance(_output_of(scenes))
+    if rows is None:
+        return known
+    kept = {row["source_episode"] for row in rows if row["variant"] != provenance.SOURCE_VARIANT}
+    refused = sorted(set(known) - kept)
+    if refused:
+        logger.warning("%s: the gate kept no new view of episodes %s; they stay as recorded", meta.repo_id, refused)
+    return {episode: cameras for episode, cameras in known.items() if episode in kept}
 
 
 def _check(meta: LeRobotDatasetMetadata, episode: int, camera: str, scene: Path | SavedScene) -> None:

@@ -13,12 +13,16 @@ from torch import Tensor
 
 from lerobot_msdyn.cameras import CameraTrack
 from lerobot_msdyn.config import MixedViewsConfig, OtherCameraConfig, PerturbationConfig, problems
+from lerobot_msdyn.coverage import HOLE_ALPHA
 from lerobot_msdyn.episode import MILLIMETRES, depth_key_of
 from lerobot_msdyn.errors import ConfigError
 from lerobot_msdyn.perturbation import Viewpoint, amounts_of, draw, moved
 from lerobot_msdyn.saved import SavedScene
-from lerobot_msdyn.training.matching import perturbation_of, scenes_of
+from lerobot_msdyn.training.live import LiveScene
+from lerobot_msdyn.training.matching import recipe_of, scenes_of
 from lerobot_msdyn.training.scene_cache import SceneCache, Scenes
+
+FACTORS = (1.0, 0.5, 0.25)  # of a change that was drawn, until little enough of the picture is empty
 
 
 class ViewMixer:
@@ -47,7 +51,9 @@ class ViewMixer:
         if isinstance(scenes, str | os.PathLike):
             scenes = Path(scenes)
         self.probability, self.seed, self.deltas = probability, seed, deltas
-        self.perturbation = perturbation_of(scenes) if perturbation is None else perturbation
+        recipe = recipe_of(scenes)
+        self.perturbation = recipe.perturbation if perturbation is None else perturbation
+        self.max_empty = recipe.max_unseen
         if isinstance(self.perturbation, OtherCameraConfig):
             raise ConfigError(
                 "perturbation is 'other_camera', whose pose is not kept with the scenes; choose another kind"
@@ -75,6 +81,7 @@ class ViewMixer:
     def draw(self, episode: int, position: int, index: int, cameras: list[str]) -> dict[str, np.ndarray]:
         """The windows of some cameras and of their depth (if recorded), by feature; each through one new pose.
 
+        A pose from which more than `max_empty` of a picture shows nothing is brought half as far, and again.
         Colours are uint8 [t,3,h,w], depth float32 [t,h,w] in m.
 
         Args:
@@ -84,36 +91,56 @@ class ViewMixer:
             cameras: from `replaced`.
         """
         live = {camera: self.cache.get(episode, camera) for camera in cameras}
-        seen_from = new_cameras(
-            self.perturbation,
-            {camera: one.scene for camera, one in live.items()},
-            self.seed,
-            index,
-            self.epoch,
-            position,
-        )
-        pictures: dict[str, np.ndarray] = {}
-        for camera in cameras:
-            depth_key = self.depth_keys[camera]
-            colour = [position + delta for delta in self.deltas.get(camera, [0])]
-            depth = [] if depth_key is None else [position + delta for delta in self.deltas.get(depth_key, [0])]
-            within = np.clip(colour + depth, 0, self._lengths[episode] - 1)
-            wanted, places = np.unique(within, return_inverse=True)
-            frames = torch.from_numpy(wanted)
-            drawn = live[camera].draw(seen_from[camera].select(frames), frames)
-            pictures[camera] = drawn.rgb[places[: len(colour)]]
-            if depth_key is not None:
-                pictures[depth_key] = drawn.depth[places[len(colour) :]]
+        for factor in FACTORS:
+            seen_from = new_cameras(
+                self.perturbation,
+                {camera: one.scene for camera, one in live.items()},
+                self.seed,
+                index,
+                self.epoch,
+                position,
+                factor,
+            )
+            pictures: dict[str, np.ndarray] = {}
+            emptiest = 0.0
+            for camera in cameras:
+                found, empty = self._windows(live[camera], seen_from[camera], camera, position, episode)
+                pictures |= found
+                emptiest = max(emptiest, empty)
+            if emptiest <= self.max_empty:
+                break
         return pictures
+
+    def _windows(
+        self, live: LiveScene, seen_from: CameraTrack, camera: str, position: int, episode: int
+    ) -> tuple[dict[str, np.ndarray], float]:
+        """The windows of one camera and of its depth, and the largest share of a picture in which nothing is."""
+        depth_key = self.depth_keys[camera]
+        colour = [position + delta for delta in self.deltas.get(camera, [0])]
+        depth = [] if depth_key is None else [position + delta for delta in self.deltas.get(depth_key, [0])]
+        within = np.clip(colour + depth, 0, self._lengths[episode] - 1)
+        wanted, places = np.unique(within, return_inverse=True)
+        frames = torch.from_numpy(wanted)
+        drawn = live.draw(seen_from.select(frames), frames)
+        pictures = {camera: drawn.rgb[places[: len(colour)]]}
+        if depth_key is not None:
+            pictures[depth_key] = drawn.depth[places[len(colour) :]]
+        return pictures, float((drawn.alpha < HOLE_ALPHA).mean((1, 2)).max())
 
 
 def new_cameras(
-    config: PerturbationConfig, scenes: Mapping[str, SavedScene], seed: int, index: int, epoch: int, position: int
+    config: PerturbationConfig,
+    scenes: Mapping[str, SavedScene],
+    seed: int,
+    index: int,
+    epoch: int,
+    position: int,
+    factor: float = 1.0,
 ) -> dict[str, CameraTrack]:
     """One draw for all cameras of a sample, for all frames of the episode.
 
     The epochs of a sample are stratified as the variants of an episode are. Changes that differ from frame to frame
-    are taken as they are at the sample's own: a window has one pose.
+    are taken as they are at the sample's own: a window has one pose. `factor` is the share of the change that is made.
     """
     views = {key: Viewpoint(scene.camera, scene.distance, scene.metric) for key, scene in scenes.items()}
     if not views:
@@ -121,7 +148,7 @@ def new_cameras(
     frames = min(len(scene) for scene in scenes.values())
     share = draw(config, seed, index, epoch, frames)
     share = share[position : position + 1] if len(share) > 1 else share
-    amounts = {key: amounts_of(config, share, view, epoch) for key, view in views.items()}
+    amounts = {key: factor * amounts_of(config, share, view, epoch) for key, view in views.items()}
     return moved(config, views, amounts)
 
 

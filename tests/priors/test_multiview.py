@@ -9,7 +9,7 @@ from test_stereo import moved
 
 from lerobot_msdyn.episode import View
 from lerobot_msdyn.errors import PriorError
-from lerobot_msdyn.priors.multiview import multiview_depth, usable_partners
+from lerobot_msdyn.priors.multiview import multiview_depth, usable_partners, why_no_partner
 from lerobot_msdyn.synthetic import make_scene
 
 
@@ -40,6 +40,11 @@ def test_only_calibrated_cameras_at_another_place_that_look_alike_count() -> Non
     assumed = replace(view, camera=replace(near.camera, origin="assumed"))
     assert usable_partners(view, [far, away, view, assumed, near]) == [near, far]
     assert usable_partners(assumed, [near]) == []
+    assert why_no_partner(view, []) == "no other camera of the episode is read with this one"
+    assert why_no_partner(assumed, [near]) == "this camera is not calibrated"
+    assert why_no_partner(view, [assumed]) == "no other camera is calibrated"
+    assert why_no_partner(view, [view]) == "the other calibrated cameras stand at the same place"
+    assert "nearest other calibrated camera looks 90 degrees elsewhere" in why_no_partner(view, [away, assumed])
 
 
 def test_cameras_that_see_different_things_are_refused() -> None:

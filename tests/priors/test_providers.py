@@ -98,7 +98,7 @@ def test_depth_that_holds_nothing_is_named_and_auto_goes_on(view: View, caplog: 
         ({"masks": "sam2"}, "hf download facebook/sam2.1-hiera-tiny$"),
         ({"masks": "edgetam"}, "hf download yonigozlan/EdgeTAM-hf$"),
         ({"tracks": "raft"}, "weights are not on this machine; fetch: python -c"),
-        ({"depth": "stereo"}, "no second camera with K, R and t"),
+        ({"depth": "stereo"}, "no other camera of the episode is read"),
         ({"depth": "absent.npz"}, "absent.npz: not a readable npz file"),
     ],
 )

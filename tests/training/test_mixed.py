@@ -1,6 +1,7 @@
 """Mixed views: what changes in a sample, what does not, and what it depends on."""
 
 import logging
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import pytest
 import torch
 from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
 
-from lerobot_msdyn import saved
+from lerobot_msdyn import provenance, saved
 from lerobot_msdyn.config import JitterConfig, OrbitConfig
 from lerobot_msdyn.errors import ConfigError, DatasetError, MsdynError
 from lerobot_msdyn.training import MixedViews
@@ -146,6 +147,40 @@ def test_the_output_itself_can_be_mixed(desk: Path, desk_scenes: Path) -> None:
     assert len(mixed.mixer.cache.scenes) == output.num_episodes == 4
     folders = [mixed.mixer.cache.scenes[episode][FRONT].parent.name for episode in range(4)]
     assert folders == ["episode_000000", "episode_000000", "episode_000001", "episode_000001"]
+
+
+def test_scenes_of_another_dataset_are_refused_by_its_name(desk: Path, desk_scenes: Path) -> None:
+    other = LeRobotDataset("local/other", root=desk, video_backend="pyav")
+    with pytest.raises(DatasetError, match="the scenes are of local/desk; expected local/other"):
+        MixedViews(other, desk_scenes)
+    assert len(MixedViews(other, saved.list_scenes(desk_scenes)).mixer.cache.scenes) == 2
+
+
+def test_episodes_that_the_gate_refused_stay_as_recorded(
+    desk: Path, desk_scenes: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    shutil.copytree(desk_scenes, tmp_path / "new")
+    rows = provenance.read_provenance(tmp_path / "new")
+    assert rows is not None
+    for row in rows:
+        row["variant"] = -1 if row["source_episode"] == 1 else row["variant"]
+    provenance.write_rows(tmp_path / "new", rows)
+    with caplog.at_level(logging.WARNING, "lerobot_msdyn"):
+        mixed = MixedViews(recorded(desk), tmp_path / "new", 1.0)
+    assert list(mixed.mixer.cache.scenes) == [0]
+    assert "the gate kept no new view of episodes [1]; they stay as recorded" in caplog.text
+
+
+def test_a_view_of_nothing_is_brought_nearer(desk: Path, desk_scenes: Path) -> None:
+    far, near = (
+        OrbitConfig(azimuth_deg=factor * 12.0, elevation_deg=0.0, translation_m=0.0, translation_rel=0.0)
+        for factor in (4, 1)
+    )
+    bounded, quarter = (MixedViews(recorded(desk), desk_scenes, 1.0, kind) for kind in (far, near))
+    bounded.mixer.max_empty, quarter.mixer.max_empty = 0.0, 1.0
+    assert torch.equal(bounded[3][FRONT], quarter[3][FRONT])
+    bounded.mixer.max_empty = 1.0
+    assert not torch.equal(bounded[3][FRONT], quarter[3][FRONT])
 
 
 def test_scenes_from_memory(desk: Path, desk_scenes: Path) -> None:
