@@ -1,0 +1,2 @@
+def drawn_table(f): return ""
+def plot(f): return ""
