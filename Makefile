@@ -7,7 +7,7 @@ PYTHON ?= $(shell command -v python || command -v python3)
 UV := $(shell command -v uv || echo .tools/bin/uv)
 VENV := .venv
 BIN := $(VENV)/bin
-EXTRAS := viz,priors,sfm,cluster,dev
+EXTRAS := viz,priors,sfm,cluster,evaluate,dev
 TESTS ?= tests
 
 setup: $(VENV)/.ready

@@ -12,6 +12,8 @@ ONLY_IN = {
     "gsplat": {"render"},
     "datatrove": {"engines"},
     "rerun": {"viewer"},
+    "flip_evaluator": {"evaluation"},
+    "lpips": {"evaluation"},
     "lerobot": {
         "action_safety",
         "episode",

@@ -1,0 +1,1 @@
+"""How far pictures are from the true ones, and the protocols by which reconstructions are compared."""
