@@ -1,6 +1,7 @@
 """What each level of motion is worth, and what other systems' models of motion would give in its place.
 
-    python benchmarks/ablation.py [--kinds push,lid,sheet,all] [--seeds 0,1,2] [--sim FOLDER --scenes A,B] [--json FILE]
+    python benchmarks/ablation.py [--kinds all,sheet,push,lid] [--seeds 0,1,2] [--sim FOLDER --scenes A,B] [--json FILE]
+    python benchmarks/ablation.py --rows "L1;L1-L3" [...]
     python benchmarks/ablation.py --report
 
 Every row is fitted to the same videos with the same priors (recorded depth, the project's own masks and tracks), number
@@ -10,7 +11,13 @@ FILE holds and draws docs/images/ablation.svg.
 
 PSNR (dB) of a picture is over the pixels that the recorded camera has seen at some time (`all`), those of bodies that
 move (`moving`), and those it saw only at another time (`disoccluded`); figures are means over cameras and frames.
-Rows without overlay, unless they say so: it hides errors of motion.
+Rows are without overlay, which hides errors of motion, unless they say so.
+
+L1, L1+L2, L1+L2+ (ten primitives), L1-L3 and L4 (particles) are the paper's: an object is an instance, and all levels
+are fitted to the tracks and kept. `of parts`: an instance is split into rigid parts first. `the method` is what the
+package does: parts registered to the video, finer levels only where they prove themselves. `rgb only`: without the
+losses of depth and mask. `flat 10`: Shape of Motion's model; `field`: Deformable 3D Gaussians'; both fitted to the
+tracks. `learned`: motion takes part in the fit; `afresh`: from none at all.
 """
 
 import argparse
@@ -25,15 +32,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from ablation_report import drawn_table, plot
+from ablation_report import drawn_table, plot, scene_table
 from ablation_rivals import warped_pictures, with_fixed_motion, with_learned_motion
 from ablation_scenes import Case, HeldOut, simulated_case, synthetic_case
-from jaxtyping import Bool, UInt8
+from jaxtyping import UInt8
 from numpy import ndarray
 
 from lerobot_msdyn.background import EmptyScene, empty_scene
 from lerobot_msdyn.config import Recipe
 from lerobot_msdyn.coverage import evidence_of
+from lerobot_msdyn.evaluation.metrics import masked_psnr_db
 from lerobot_msdyn.files import write_whole
 from lerobot_msdyn.fitting import fit
 from lerobot_msdyn.initialisation import initialise
@@ -46,8 +54,9 @@ from lerobot_msdyn.views import Reconstruction, new_pictures
 
 JSON = Path(__file__).with_suffix(".json")
 PLOT = Path(__file__).parent.parent / "docs" / "images" / "ablation.svg"
-BY_TRACKS = {"gate": False, "register": False}  # as the paper: levels are fitted to the tracks, and kept
 ALL = ["object", "primitive", "grain"]
+TRACKS = {"gate": False, "register": False}  # levels are fitted to the tracks, and kept
+PAPER = TRACKS | {"max_parts": 1}  # and an object is an instance
 
 
 @dataclass(frozen=True)
@@ -64,22 +73,23 @@ class Row:
 ROWS = (
     Row("source picture"),
     Row("warp + background"),
-    Row("L1", BY_TRACKS | {"levels": ["object"]}),
-    Row("L1+L2", BY_TRACKS | {"levels": ["object", "primitive"]}),
-    Row("L1+L2+", BY_TRACKS | {"levels": ["object", "primitive"], "primitives": 10}),
-    Row("L1-L3", BY_TRACKS | {"levels": ALL}),
-    Row("L4", BY_TRACKS | {"levels": [*ALL, "particle"]}),
-    Row("L1-L3, rgb only", BY_TRACKS | {"levels": ALL}, weights={"depth": 0.0, "mask": 0.0}),
-    Row("L1-L3, learned", BY_TRACKS | {"levels": ALL}, learned="on"),
-    Row("isotropic", BY_TRACKS | {"levels": ALL}, {"isotropic": True}),
-    Row("flat 10", BY_TRACKS | {"levels": ["flat"]}),
-    Row("flat 10, learned", BY_TRACKS | {"levels": ["flat"]}, learned="on"),
-    Row("field", BY_TRACKS | {"levels": ["field"]}),
-    Row("field, learned", BY_TRACKS | {"levels": ["field"]}, learned="on"),
-    Row("field, learned afresh", BY_TRACKS | {"levels": ["field"]}, learned="afresh"),
-    Row("registered L1", {"levels": ["object"]}),
-    Row("registered, gated L1-L3", {"levels": ALL}),
-    Row("the same + overlay", {"levels": ALL}, {"overlay": True}),
+    Row("L1", PAPER | {"levels": ["object"]}),
+    Row("L1+L2", PAPER | {"levels": ["object", "primitive"]}),
+    Row("L1+L2+", PAPER | {"levels": ["object", "primitive"], "primitives": 10}),
+    Row("L1-L3", PAPER | {"levels": ALL}),
+    Row("L4", PAPER | {"levels": [*ALL, "particle"]}),
+    Row("L1-L3, rgb only", PAPER | {"levels": ALL}, weights={"depth": 0.0, "mask": 0.0}),
+    Row("L1-L3, isotropic", PAPER | {"levels": ALL}, {"isotropic": True}),
+    Row("L1-L3, learned", PAPER | {"levels": ALL}, learned="on"),
+    Row("flat 10", TRACKS | {"levels": ["flat"]}),
+    Row("flat 10, learned", TRACKS | {"levels": ["flat"]}, learned="on"),
+    Row("field", TRACKS | {"levels": ["field"]}),
+    Row("field, learned", TRACKS | {"levels": ["field"]}, learned="on"),
+    Row("field, learned afresh", TRACKS | {"levels": ["field"]}, learned="afresh"),
+    Row("L1 of parts", TRACKS | {"levels": ["object"]}),
+    Row("L1-L3 of parts", TRACKS | {"levels": ALL}),
+    Row("the method: registered, gated", {"levels": ALL}),
+    Row("the method with overlay", {"levels": ALL}, {"overlay": True}),
 )
 
 
@@ -87,12 +97,12 @@ ROWS = (
 class Settings:
     """What figures depend on; a file holds those of one choice."""
 
-    steps: int = 200
+    steps: int = 100
     width: int = 160  # px
     frames: int = 40  # of made-up scenes
-    every: int = 6  # of a made-up scene's frames there is truth
-    stride: int = 2  # frames of simulated episodes that are used
-    sim_every: int = 2  # of those of them with truth
+    every: int = 8  # frames of made-up scenes with truth
+    stride: int = 2  # frames of simulated episodes that are used ...
+    sim_every: int = 3  # ... and of those with truth
 
 
 @dataclass(frozen=True)
@@ -123,7 +133,7 @@ def prepared(case: Case) -> Prepared:
 
 
 def reconstructed(known: Prepared, row: Row, recipe: Recipe) -> Reconstruction:
-    """A row's scene: the steps of `pipeline.reconstruct` on given priors, and motion that is learned where it says so."""
+    """A row's scene: `pipeline.reconstruct` on given priors, with motion that is learned where the row says so."""
     view, priors = known.case.view, known.priors
     distance = look_at_distance(known.empty.depth)
     scene = initialise(view, priors, recipe.scene, recipe.motion, known.empty)
@@ -156,14 +166,6 @@ def pictures(known: Prepared, row: Row, settings: Settings) -> Iterator[tuple[He
             yield heldout, list(warped_pictures(case, known.priors, known.empty, heldout))
 
 
-def masked_psnr(one: UInt8[ndarray, "h w 3"], other: UInt8[ndarray, "h w 3"], mask: Bool[ndarray, "h w"]) -> float:
-    """Peak signal-to-noise ratio (dB) over the pixels of a mask; none: not a number."""
-    if not mask.any():
-        return float("nan")
-    error = np.square((one[mask].astype(np.float64) - other[mask]) / 255).mean()
-    return float(-10 * np.log10(max(error, 1e-10)))
-
-
 def measured(known: Prepared, row: Row, settings: Settings) -> dict[str, Any]:
     """A row's figures on one case."""
     start = time.process_time()
@@ -173,22 +175,31 @@ def measured(known: Prepared, row: Row, settings: Settings) -> dict[str, Any]:
             seen = heldout.seen[i]
             masks = {"all": seen > 0, "moving": (seen > 0) & heldout.moving[i], "disoccluded": seen == 1}
             for name, mask in masks.items():
-                scores[name].append(masked_psnr(picture, heldout.rgb[i], mask))
-    case = known.case
-    found = {name: round(float(np.nanmean(values)), 3) for name, values in scores.items()}
-    return {"scene": case.name, "seed": case.seed, "row": row.name} | found | {"cpu_s": round(time.process_time() - start, 1)}
+                if mask.any():
+                    scores[name].append(masked_psnr_db(picture, heldout.rgb[i], mask))
+    found = {name: round(float(np.mean(values)), 3) for name, values in scores.items()}
+    place = {"scene": known.case.name, "seed": known.case.seed, "row": row.name}
+    return place | found | {"cpu_s": round(time.process_time() - start, 1)}
 
 
 def cases(options: argparse.Namespace, settings: Settings) -> Iterator[tuple[str, int, Any]]:
     """Name, seed and maker of every case."""
     for seed in options.seeds:
         for kind in options.kinds:
-            yield kind, seed, lambda kind=kind, seed=seed: synthetic_case(
-                kind, seed, settings.frames, settings.width, settings.every
+            yield (
+                kind,
+                seed,
+                lambda kind=kind, seed=seed: synthetic_case(
+                    kind, seed, settings.frames, settings.width, settings.every
+                ),
             )
     for scene in options.scenes if options.sim else ():
-        yield scene, 0, lambda scene=scene: simulated_case(
-            options.sim / scene, 0, settings.width, settings.stride, settings.sim_every
+        yield (
+            scene,
+            0,
+            lambda scene=scene: simulated_case(
+                options.sim / scene, 0, settings.width, settings.stride, settings.sim_every
+            ),
         )
 
 
@@ -207,7 +218,7 @@ def run(options: argparse.Namespace, settings: Settings) -> None:
     figures = read(options.json, settings)
     done = {(one["scene"], one["seed"], one["row"]) for one in figures}
     for name, seed, make in cases(options, settings):
-        rows = [row for row in ROWS if (name, seed, row.name) not in done]
+        rows = [row for row in ROWS if row.name in options.rows and (name, seed, row.name) not in done]
         if not rows:
             continue
         known = prepared(make())
@@ -226,10 +237,12 @@ def words(text: str) -> list[str]:
 def main(arguments: list[str]) -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kinds", type=words, default=["push", "lid", "sheet", "all"], help="of made-up scenes")
+    parser.add_argument("--kinds", type=words, default=["all", "sheet", "push", "lid"], help="of made-up scenes")
     parser.add_argument("--seeds", type=lambda text: [int(word) for word in words(text)], default=[0, 1, 2])
     parser.add_argument("--sim", type=Path, help="folder of simulated episodes (docs/evaluate.md)")
     parser.add_argument("--scenes", type=words, default=["rigid_push", "pick_place", "deformable", "free_arm"])
+    names = [row.name for row in ROWS]
+    parser.add_argument("--rows", type=lambda text: text.split(";"), default=names, help="; between them")
     parser.add_argument("--json", type=Path, default=JSON)
     parser.add_argument("--report", action="store_true", help="print the table of the figures, and draw them")
     for name, value in asdict(Settings()).items():
@@ -239,8 +252,8 @@ def main(arguments: list[str]) -> None:
     settings = Settings(**{name: getattr(options, name) for name in asdict(Settings())})
     if options.report:
         figures = read(options.json, settings)
-        print(drawn_table(figures))
-        write_whole(PLOT, plot(figures).encode())
+        print(drawn_table(figures, options.scenes), scene_table(figures), sep="\n\n")
+        write_whole(PLOT, plot(figures, options.scenes).encode())
     else:
         with torch_on_one_thread():
             run(options, settings)

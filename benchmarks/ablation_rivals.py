@@ -45,9 +45,7 @@ def warped_pictures(
         yield cv2.inpaint(colours.clip(0, 255).round().astype(np.uint8), holes, FILL_RADIUS_PX, cv2.INPAINT_TELEA)
 
 
-def splat(
-    rgb: UInt8[Tensor, "h w 3"], depth: Float[Tensor, "h w"], source: CameraTrack, target: CameraTrack
-) -> Splat:
+def splat(rgb: UInt8[Tensor, "h w 3"], depth: Float[Tensor, "h w"], source: CameraTrack, target: CameraTrack) -> Splat:
     """Pixels of known depth (m) spread over the four nearest pixels of another view; the nearest surface wins."""
     height, width = depth.shape
     world = transform_points(source.world_from_camera[0], unproject_image(depth, source.intrinsics[0]).reshape(-1, 3))

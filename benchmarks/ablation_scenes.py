@@ -1,4 +1,4 @@
-"""Scenes with true held-out views for the ablation: made-up ones, and simulated episodes in the layout of evaluate nvs."""
+"""Scenes with true held-out views for the ablation: made-up ones, and simulated episodes (docs/evaluate.md)."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,7 +40,7 @@ class Case:
 
 
 def synthetic_case(kind: str, seed: int, frames: int, width: int, every: int) -> Case:
-    """A made-up scene of 4:3, its pictures as they are rendered (no codec); of every `every`-th frame there is truth."""
+    """A made-up scene of 4:3, its pictures as they are rendered (no codec); every `every`-th frame has truth."""
     scene = make_scene(kind, seed, frames, width, width * 3 // 4)
     recorded = scene.render(scene.camera)
     times = np.arange(every // 2, frames, every)
@@ -54,7 +54,7 @@ def synthetic_case(kind: str, seed: int, frames: int, width: int, every: int) ->
 
 
 def simulated_case(folder: Path, seed: int, width: int, stride: int, every: int) -> Case:
-    """Every `stride`-th frame of a simulated episode at `width` px; of every `every`-th of those with truth it is used."""
+    """Every `stride`-th frame of a simulated episode at `width` px, and the truth of every `every`-th that has any."""
     view = read_clip(folder, stride, width)
     paths = [folder / "gt" / "heldout" / f"{name}.npz" for name in CAMERAS]
     with np.load(folder / "gt" / "bodies.npz", allow_pickle=False) as bodies:
