@@ -96,14 +96,14 @@ def _values(figures: Figures, name: str) -> list:
 
 
 def _over_seeds(figures: Figures, row: str, name: str, kinds: list[str], seeds: list[int]) -> str:
-    """Median, least and largest over the seeds of which all kinds are known."""
+    """Median over the seeds of which all kinds are known, the least and the largest; of one seed its value alone."""
     means = []
     for seed in seeds:
         some = [one[name] for one in figures if one["row"] == row and one["seed"] == seed]
         if len(some) == len(kinds):
             means.append(sum(some) / len(some))
-    if not means:
-        return ""
+    if len(means) < 2:
+        return "".join(f"{value:.2f} (one seed)" for value in means)
     return f"{median(means):.2f} ({min(means):.2f} to {max(means):.2f})"
 
 
