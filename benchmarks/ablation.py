@@ -1,13 +1,13 @@
 """What each level of motion is worth, and what other systems' models of motion would give in its place.
 
     python benchmarks/ablation.py [--kinds all,sheet,push,lid] [--seeds 0,1,2] [--sim FOLDER --scenes A,B] [--json FILE]
-    python benchmarks/ablation.py --rows "L1;L1-L3" [...]
+    python benchmarks/ablation.py --true_priors --rows "L1;L1-L3" [...]
     python benchmarks/ablation.py --report
 
-Every row is fitted to the same videos with the same priors (recorded depth, the project's own masks and tracks), number
-of steps, losses and rasterizer, and drawn from held-out cameras. FILE gets a row's figures as soon as they are known;
-what it holds already is not measured again, so a run that was stopped goes on. `--report` prints the table of what
-FILE holds and draws docs/images/ablation.svg.
+Every row is fitted to the same videos with the same priors (recorded depth, the project's own masks and tracks, or the
+true ones), number of steps, losses and rasterizer, and drawn from held-out cameras. FILE gets a row's figures as soon
+as they are known; what it holds already is not measured again, so a run that was stopped goes on. `--report` prints the
+table of what FILE holds and draws docs/images/ablation.svg.
 
 PSNR (dB) of a picture is over the pixels that the recorded camera has seen at some time (`all`), those of bodies that
 move (`moving`), and those it saw only at another time (`disoccluded`); figures are means over cameras and frames.
@@ -126,9 +126,11 @@ def recipe_of(row: Row, settings: Settings, seed: int) -> Recipe:
 
 
 def prepared(case: Case) -> Prepared:
-    """The priors of a case's video."""
+    """The priors of a case's video: the project's own, or the truth where the case has it."""
     recipe = recipe_of(ROWS[0], Settings(), case.seed)
     priors = estimate_priors(case.view, recipe.priors, recipe.camera)
+    if case.truth is not None:
+        priors = replace(priors, instances=case.truth.instances, tracks=case.truth.tracks)
     return Prepared(case, priors, empty_scene(case.view.rgb, priors.depth, priors.instances))
 
 
@@ -178,7 +180,9 @@ def measured(known: Prepared, row: Row, settings: Settings) -> dict[str, Any]:
                 if mask.any():
                     scores[name].append(masked_psnr_db(picture, heldout.rgb[i], mask))
     found = {name: round(float(np.mean(values)), 3) for name, values in scores.items()}
-    place = {"scene": known.case.name, "seed": known.case.seed, "row": row.name}
+    case = known.case
+    priors = "own" if case.truth is None else "true"
+    place = {"scene": case.name, "seed": case.seed, "priors": priors, "row": row.name}
     return place | found | {"cpu_s": round(time.process_time() - start, 1)}
 
 
@@ -193,7 +197,7 @@ def cases(options: argparse.Namespace, settings: Settings) -> Iterator[tuple[str
                     kind, seed, settings.frames, settings.width, settings.every
                 ),
             )
-    for scene in options.scenes if options.sim else ():
+    for scene in options.scenes if options.sim and not options.true_priors else ():
         yield (
             scene,
             0,
@@ -216,7 +220,8 @@ def read(path: Path, settings: Settings) -> list[dict[str, Any]]:
 def run(options: argparse.Namespace, settings: Settings) -> None:
     """Measure what the file does not hold yet."""
     figures = read(options.json, settings)
-    done = {(one["scene"], one["seed"], one["row"]) for one in figures}
+    priors = "true" if options.true_priors else "own"
+    done = {(one["scene"], one["seed"], one["row"]) for one in figures if one["priors"] == priors}
     for name, seed, make in cases(options, settings):
         rows = [row for row in ROWS if row.name in options.rows and (name, seed, row.name) not in done]
         if not rows:
@@ -241,6 +246,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--seeds", type=lambda text: [int(word) for word in words(text)], default=[0, 1, 2])
     parser.add_argument("--sim", type=Path, help="folder of simulated episodes (docs/evaluate.md)")
     parser.add_argument("--scenes", type=words, default=["rigid_push", "pick_place", "deformable", "free_arm"])
+    parser.add_argument("--true_priors", action="store_true", help="true masks and tracks, of made-up scenes alone")
     names = [row.name for row in ROWS]
     parser.add_argument("--rows", type=lambda text: text.split(";"), default=names, help="; between them")
     parser.add_argument("--json", type=Path, default=JSON)

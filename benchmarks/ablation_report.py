@@ -18,7 +18,7 @@ def drawn_table(figures: Figures, simulated: Iterable[str]) -> str:
 
     Behind the medians stand the least and the largest of the seeds.
     """
-    simulated = set(simulated)
+    simulated, figures = set(simulated), _own(figures)
     made_up = [one for one in figures if one["scene"] not in simulated]
     others = [one for one in figures if one["scene"] in simulated]
     kinds, seeds = _values(made_up, "scene"), _values(made_up, "seed")
@@ -32,18 +32,21 @@ def drawn_table(figures: Figures, simulated: Iterable[str]) -> str:
 
 
 def scene_table(figures: Figures) -> str:
-    """PSNR over moving pixels scene by scene; medians over the seeds where there are several."""
-    scenes = _values(figures, "scene")
-    lines = [f"| | {' | '.join(scenes)} |", "|---" * (len(scenes) + 1) + "|"]
+    """PSNR over moving pixels scene by scene, with own or true priors; medians where there are several seeds."""
+    scenes = list(dict.fromkeys((one["scene"], one["priors"]) for one in figures))
+    lines = [f"| | {' | '.join(f'{scene}, {priors}' for scene, priors in scenes)} |", "|---" * (len(scenes) + 1) + "|"]
     for row in _values(figures, "row"):
-        values = ([one["moving"] for one in figures if (one["row"], one["scene"]) == (row, scene)] for scene in scenes)
+        values = (
+            [one["moving"] for one in figures if (one["row"], one["scene"], one["priors"]) == (row, *scene)]
+            for scene in scenes
+        )
         lines.append(f"| {row} | {' | '.join(f'{median(some):.2f}' if some else '' for some in values)} |")
     return "\n".join(lines)
 
 
 def plot(figures: Figures, simulated: Iterable[str]) -> str:
     """An SVG: per row a dot for each case, its PSNR over moving pixels less that of `REFERENCE`, and their median."""
-    simulated = set(simulated)
+    simulated, figures = set(simulated), _own(figures)
     reference = {(one["scene"], one["seed"]): one["moving"] for one in figures if one["row"] == REFERENCE}
     gains = {
         row: [
@@ -88,6 +91,11 @@ def plot(figures: Figures, simulated: Iterable[str]) -> str:
                 'stroke-width="2"/>'
             )
     return "\n".join([*parts, "</svg>\n"])
+
+
+def _own(figures: Figures) -> Figures:
+    """Those with the project's own priors."""
+    return [one for one in figures if one["priors"] == "own"]
 
 
 def _values(figures: Figures, name: str) -> list:

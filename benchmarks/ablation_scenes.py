@@ -10,11 +10,14 @@ import torch
 from corruptions import read_clip
 from jaxtyping import Bool, Int, UInt8
 from numpy import ndarray
+from torch import Tensor
 
 from lerobot_msdyn.cameras import CameraTrack
 from lerobot_msdyn.episode import View
-from lerobot_msdyn.synthetic import covisibility, heldout_cameras, make_scene
+from lerobot_msdyn.priors import PointTracks
+from lerobot_msdyn.synthetic import SyntheticScene, covisibility, heldout_cameras, make_scene
 
+TRUE_TRACKS = 3000
 CAMERAS = ("az-10", "az+10", "el-08", "tx+05")  # of those that are held out
 
 
@@ -30,6 +33,14 @@ class HeldOut:
 
 
 @dataclass(frozen=True)
+class Truth:
+    """Priors without any error."""
+
+    instances: UInt8[Tensor, "t h w"]
+    tracks: PointTracks
+
+
+@dataclass(frozen=True)
 class Case:
     """A recorded video with depth, and held-out cameras."""
 
@@ -37,9 +48,10 @@ class Case:
     seed: int
     view: View
     heldout: tuple[HeldOut, ...]
+    truth: Truth | None = None  # given: used instead of the project's own priors
 
 
-def synthetic_case(kind: str, seed: int, frames: int, width: int, every: int) -> Case:
+def synthetic_case(kind: str, seed: int, frames: int, width: int, every: int, *, true_priors: bool = False) -> Case:
     """A made-up scene of 4:3, its pictures as they are rendered (no codec); every `every`-th frame has truth."""
     scene = make_scene(kind, seed, frames, width, width * 3 // 4)
     recorded = scene.render(scene.camera)
@@ -50,7 +62,13 @@ def synthetic_case(kind: str, seed: int, frames: int, width: int, every: int) ->
             true = scene.render(camera, times.tolist())
             seen = covisibility(scene, recorded.depth.numpy(), camera, times.tolist())
             heldout.append(HeldOut(camera, times, true.rgb.numpy(), seen, true.instances.numpy() > 0))
-    return Case(kind, seed, View(recorded.rgb, scene.camera, recorded.depth), tuple(heldout))
+    truth = Truth(recorded.instances, _true_tracks(scene)) if true_priors else None
+    return Case(kind, seed, View(recorded.rgb, scene.camera, recorded.depth), tuple(heldout), truth)
+
+
+def _true_tracks(scene: SyntheticScene) -> PointTracks:
+    tracks = scene.tracks(TRUE_TRACKS, scene.seed)
+    return PointTracks(tracks.xy, tracks.visible, tracks.visible.float(), tracks.instance)
 
 
 def simulated_case(folder: Path, seed: int, width: int, stride: int, every: int) -> Case:

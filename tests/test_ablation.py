@@ -91,6 +91,16 @@ def test_motion_that_is_learned_changes_in_the_fit_and_is_fixed_afterwards(ablat
         assert not torch.equal(fixed, learned)
 
 
+def test_true_priors_are_those_of_the_made_up_scene(ablation: ModuleType) -> None:
+    own, true = (
+        ablation.prepared(ablation.synthetic_case("push", 0, 12, 64, 6, true_priors=given)) for given in (False, True)
+    )
+    assert own.case.truth is None
+    assert true.priors.instances is true.case.truth.instances
+    assert set(true.priors.tracks.instance.unique().tolist()) == {1, 2}
+    assert len(true.priors.tracks) > len(own.priors.tracks)
+
+
 def test_a_run_goes_on_where_it_was_stopped(ablation: ModuleType, tmp_path: Path) -> None:
     path = tmp_path / "figures.json"
     first = [*TINY, "--json", str(path), "--rows", "source picture"]
@@ -120,7 +130,15 @@ def test_simulated_episodes_are_read_at_the_frames_that_are_used(ablation: Modul
 
 def figures() -> list[dict]:
     return [
-        {"scene": scene, "seed": seed, "row": row, "all": base + seed, "moving": base - seed, "disoccluded": base}
+        {
+            "scene": scene,
+            "seed": seed,
+            "priors": "own",
+            "row": row,
+            "all": base + seed,
+            "moving": base - seed,
+            "disoccluded": base,
+        }
         for row, base in (("L1", 20.0), ("L1-L3", 22.0))
         for scene, seed in (("push", 0), ("push", 1), ("push", 2), ("real <arm>", 0))
     ]
@@ -131,7 +149,8 @@ def test_the_table_gives_medians_and_their_spread(report: ModuleType) -> None:
     assert lines[2] == (
         "| L1 | 21.00 (20.00 to 22.00) | 19.00 (18.00 to 20.00) | 20.00 (20.00 to 20.00) | 20.00 | 20.00 | 20.00 |"
     )
-    assert report.scene_table(figures()).splitlines()[3] == "| L1-L3 | 21.00 | 22.00 |"
+    true = {"scene": "push", "seed": 0, "priors": "true", "row": "L1-L3", "moving": 30.0}
+    assert report.scene_table([*figures(), true]).splitlines()[3] == "| L1-L3 | 21.00 | 22.00 | 30.00 |"
 
 
 def test_a_row_that_is_not_finished_stays_empty(report: ModuleType) -> None:
