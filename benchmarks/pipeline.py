@@ -1,11 +1,16 @@
 """Times every stage of an episode, and how time and memory grow.
 
-    python benchmarks/pipeline.py [--recipe quick] [--steps N] [--long] [--json FILE]
+    python benchmarks/pipeline.py [--recipe quick] [--steps N] [--small | --long] [--gate] [--json FILE]
 
 Made-up scenes with recorded depth: a base case, and one run each with twice the frames, twice the width and height,
 twice the variants, and three episodes. Stages: read, priors, initial scene, fit, render (holes filled, not encoded).
 Every run is a process of its own, whose peak of resident memory is given; below it how many times the base case's
-each figure is. `--long` reconstructs small videos of 300 and 3,000 frames instead: the bound on memory.
+each figure is. `--small`: the same at half the size and half the frames. `--long` reconstructs small videos of 300 and
+3,000 frames instead: the bound on memory.
+
+`--gate` ends with 1 where something grows more than in the committed pipeline.json by more than SLACK: how many times
+the base case's the processor time of a stage, of all of them, or the memory is. Processor time hardly depends on what
+else the machine does. The baseline is that of `--small --steps 40 --json benchmarks/pipeline.json`.
 """
 
 import argparse
@@ -22,6 +27,9 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 STAGES = ("shared background", "read", "priors", "initial scene", "fit", "render")
+BASELINE = Path(__file__).with_suffix(".json")
+SLACK = 1.3  # a figure may grow by so many times what it grows by in the baseline
+LEAST_S = 0.5  # of processor time in the base case, from which a stage is judged
 
 
 @dataclass(frozen=True)
@@ -45,6 +53,8 @@ CASES = (
     replace(BASE, name="episodes x 3", episodes=3),
 )
 
+SMALL = tuple(replace(case, frames=case.frames // 2, width=case.width // 2, height=case.height // 2) for case in CASES)
+
 LONG = (
     Case("300 frames", frames=300, width=64, height=48, variants=1),
     Case("3,000 frames", frames=3000, width=64, height=48, variants=1),
@@ -52,19 +62,20 @@ LONG = (
 
 
 def timed(function: Callable, name: str, seconds: dict[str, float]) -> Callable:
-    """The same function, whose time is added up under a name."""
+    """The same function, whose time is added up under a name, and its processor time under "cpu NAME"."""
 
     def wrapper(*arguments: object, **named: object) -> object:
-        start = time.perf_counter()
+        start, cpu = time.perf_counter(), time.process_time()
         result = function(*arguments, **named)
         seconds[name] += time.perf_counter() - start
+        seconds[f"cpu {name}"] += time.process_time() - cpu
         return result
 
     return wrapper
 
 
 def measure(case: Case, recipe_name: str, steps: int | None, pipe: Connection) -> None:
-    """Send the seconds of every stage and the peak of resident memory (MB)."""
+    """Send the seconds and processor seconds of every stage, and the peak of resident memory (MB)."""
     from lerobot_msdyn import pipeline, views
     from lerobot_msdyn.bounds import new_cameras
     from lerobot_msdyn.cli import parse_config
@@ -95,10 +106,10 @@ def measure(case: Case, recipe_name: str, steps: int | None, pipe: Connection) -
         backgrounds = share(source, [key], recipe)
         pipeline.estimate_priors = timed(pipeline.estimate_priors, "priors", seconds)
         pipeline.initialise = timed(pipeline.initialise, "initial scene", seconds)
+        pipeline.fit = timed(pipeline.fit, "fit", seconds)
         for index in range(case.episodes):
             view = read(source, index, [key], recipe.camera).views[key]
             scene = pipeline.reconstruct(view, recipe, backgrounds=backgrounds.get(key, []))
-            seconds["fit"] += scene.seconds
             for variant in range(case.variants):
                 render(scene, new_cameras({key: scene}, recipe, index, variant).cameras[key])
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
@@ -106,7 +117,7 @@ def measure(case: Case, recipe_name: str, steps: int | None, pipe: Connection) -
 
 
 def run(case: Case, recipe: str, steps: int | None) -> dict[str, float]:
-    """One case in a process of its own: seconds by stage, in all, per new picture, and the peak of memory."""
+    """One case in a process of its own: seconds and processor seconds by stage and in all, and the peak of memory."""
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=measure, args=(case, recipe, steps, sender))
@@ -114,7 +125,9 @@ def run(case: Case, recipe: str, steps: int | None) -> dict[str, float]:
     sender.close()
     seconds, peak_mb = receiver.recv()
     process.join()
-    return {name: seconds.get(name, 0.0) for name in STAGES} | {"all": sum(seconds.values()), "peak MB": peak_mb}
+    found = {prefix + name: seconds.get(prefix + name, 0.0) for prefix in ("", "cpu ") for name in STAGES}
+    totals = {prefix + "all": sum(found[prefix + name] for name in STAGES) for prefix in ("", "cpu ")}
+    return {name: round(value, 3) for name, value in (found | totals | {"peak MB": peak_mb}).items()}
 
 
 def growth(row: dict[str, float], base: dict[str, float], columns: tuple[str, ...]) -> str:
@@ -125,28 +138,53 @@ def growth(row: dict[str, float], base: dict[str, float], columns: tuple[str, ..
     )
 
 
-def main() -> None:
+def violations(rows: list[dict], baseline: list[dict]) -> list[str]:
+    """What `--gate` refuses: what grows more from the first case to another than it does in the baseline.
+
+    Raises:
+        SystemExit: the baseline is of other cases, another recipe or another number of steps.
+    """
+    given = ("name", "frames", "width", "height", "variants", "episodes", "recipe", "steps")
+    if [[row[key] for key in given] for row in rows] != [[row[key] for key in given] for row in baseline]:
+        sys.exit(f"{BASELINE.name} is of other cases than these; expected --small --steps {baseline[0]['steps']}")
+    judged = [f"cpu {name}" for name in (*STAGES, "all") if baseline[0][f"cpu {name}"] >= LEAST_S] + ["peak MB"]
+    found = []
+    for row, past in zip(rows[1:], baseline[1:], strict=True):
+        for name in judged:
+            now, before = row[name] / rows[0][name], past[name] / baseline[0][name]
+            if now > SLACK * before:
+                found.append(f"{row['name']}: {name} is {now:.2f} times the base case's; the baseline has {before:.2f}")
+    return found
+
+
+def main() -> int:
     """Entry point."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--recipe", default="quick")
     parser.add_argument("--steps", type=int, help="of the fit; default: the recipe's")
-    parser.add_argument("--long", action="store_true", help="300 and 3,000 frames instead")
+    size = parser.add_mutually_exclusive_group()
+    size.add_argument("--small", action="store_true", help="half the size, half the frames")
+    size.add_argument("--long", action="store_true", help="300 and 3,000 frames instead")
+    parser.add_argument("--gate", action="store_true", help=f"fail where something grows more than in {BASELINE.name}")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    rows = []
+    rows: list[dict] = []
     columns = (*STAGES, "all", "peak MB")
     sys.stdout.write(f"{'seconds':14s}" + "".join(f"{name:>{max(9, len(name) + 2)}s}" for name in columns) + "\n")
-    for case in LONG if options.long else CASES:
+    for case in LONG if options.long else SMALL if options.small else CASES:
         row = run(case, options.recipe, options.steps)
-        rows.append(asdict(case) | row)
+        rows.append(asdict(case) | {"recipe": options.recipe, "steps": options.steps} | row)
         line = "".join(f"{row[name]:{max(9, len(name) + 2)}.1f}" for name in columns)
         sys.stdout.write(f"{case.name:14s}{line}\n")
         if len(rows) > 1:
             sys.stdout.write(f"{'  times base':14s}{growth(row, rows[0], columns)}\n")
         sys.stdout.flush()
+    wrong = violations(rows, json.loads(BASELINE.read_text())) if options.gate else []
     if options.json:
         options.json.write_text(json.dumps(rows, indent=1) + "\n")
+    sys.stdout.write("".join(f"{line}\n" for line in wrong))
+    return 1 if wrong else 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

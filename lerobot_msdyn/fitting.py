@@ -2,8 +2,9 @@
 
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
@@ -70,8 +71,11 @@ def fit(
     seed: int,
     backend: str = "auto",
     progress: Callable[[int], object] = lambda steps: None,
+    learned: Sequence[dict[str, Any]] = (),
 ) -> FitResult:
-    """Fit a scene to one camera's video, on the device that holds the scene; motion stays as it was initialised.
+    """Fit a scene to one camera's video, on the device that holds the scene.
+
+    Motion stays as it was initialised, unless its tensors are `learned`.
 
     Args:
         scene: where to start from; it is not changed.
@@ -83,6 +87,7 @@ def fit(
         seed: fixes the order of the frames.
         backend: of the rasterizer.
         progress: called with the number of steps done since the last call.
+        learned: further groups of parameters for Adam, such as leaves among the scene's levels; changed in place.
 
     Raises:
         EpisodeError: the loss is no finite number any more.
@@ -94,6 +99,8 @@ def fit(
     if config.sh_degree > 0:
         scene = replace(scene, moving=with_slope(scene.moving))
     scene, optimizer = _trainable(scene, config.learning_rates, distance)
+    for group in learned:
+        optimizer.add_param_group(group)
     decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, FINAL_RATE ** (1 / max(config.steps, 1)))
     moves = priors.instances > 0
     targets = to_device(_Targets(view, priors.depth, moves, certain_pixels(moves, MASK_BAND_PX)), scene.device)

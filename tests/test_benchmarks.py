@@ -132,3 +132,36 @@ def test_the_gpu_benchmark_runs_on_the_cpu(
     said = capsys.readouterr().out
     assert "augment ended with" not in said
     assert "frames per s, drawn alone" in said
+
+
+@pytest.fixture
+def pipeline(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    return importlib.import_module("pipeline")
+
+
+def test_the_gate_of_the_pipeline_judges_how_figures_grow(pipeline: ModuleType) -> None:
+    baseline = json.loads(pipeline.BASELINE.read_text())
+    assert [row["name"] for row in baseline] == [case.name for case in pipeline.SMALL]
+    assert pipeline.violations(baseline, baseline) == []
+    slower_machine = [
+        row | {name: 3 * value for name, value in row.items() if name.startswith("cpu ")} for row in baseline
+    ]
+    assert pipeline.violations(slower_machine, baseline) == []
+    worse = [dict(row) for row in baseline]
+    worse[1]["cpu all"] *= 1.5
+    worse[2]["peak MB"] *= 1.5
+    found = pipeline.violations(worse, baseline)
+    assert len(found) == 2
+    assert found[0].startswith("frames x 2: cpu all is ")
+    assert found[1].startswith("size x 2: peak MB is ")
+    with pytest.raises(SystemExit, match="other cases"):
+        pipeline.violations([row | {"steps": 41} for row in baseline], baseline)
+
+
+def test_time_is_added_up_by_stage(pipeline: ModuleType) -> None:
+    seconds = dict.fromkeys(("sum", "cpu sum"), 0.0)
+    call = pipeline.timed(sum, "sum", seconds)
+    assert [call([1, 2]), call(range(100_000))] == [3, 4999950000]
+    assert seconds["cpu sum"] > 0
+    assert seconds["sum"] > 0

@@ -70,6 +70,25 @@ def test_the_scene_that_was_given_is_not_changed() -> None:
     assert result.scene.levels is before.levels
 
 
+def test_motion_is_learned_where_its_tensors_are_given() -> None:
+    view, priors = still_video()
+    scene = grey_scene(view)
+    shift = scene.levels[0].displacements.clone().requires_grad_()  # type: ignore[union-attr]
+    before = shift.detach().clone()
+    count = len(scene.static)
+    scene = dataclasses.replace(
+        scene,
+        moving=scene.static,
+        levels=(dataclasses.replace(scene.levels[0], displacements=shift),),
+        indices=(torch.zeros(count, 1, dtype=torch.long),),
+        logits=(torch.zeros(count, 1),),
+    )
+    learned = [{"params": [shift], "lr": 1e-3}]
+    result = fit(scene, view, priors, FitConfig(steps=3), empty=view.rgb[0], distance=1.0, seed=0, learned=learned)
+    assert result.scene.levels is scene.levels
+    assert not torch.equal(shift, before)
+
+
 def test_same_seed_same_result() -> None:
     assert torch.equal(run(5)[1].scene.static.sh, run(5)[1].scene.static.sh)
 

@@ -1,0 +1,113 @@
+"""What the ablation compares with that the library does not have: pictures warped by depth, and learned motion."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from ablation_scenes import Case, HeldOut
+from jaxtyping import Bool, Float, Float32, UInt8
+from numpy import ndarray
+from torch import Tensor
+
+from lerobot_msdyn.background import EmptyScene
+from lerobot_msdyn.cameras import CameraTrack
+from lerobot_msdyn.geometry import project, transform_points, unproject_image
+from lerobot_msdyn.motion.bases import MotionLevel
+from lerobot_msdyn.motion.field import DeformationField
+from lerobot_msdyn.priors import Priors
+from lerobot_msdyn.scene import DynamicScene
+
+FIELD_RATE = 1e-3  # of a deformation field's layers
+TURN_RATE, SHIFT_RATE = 1e-3, 1e-4  # of the bases' knots; shifts in units of the look-at distance
+LEAST_WEIGHT = 0.05  # of a pixel that something was splatted on
+SAME_SURFACE_M, SAME_SURFACE = 0.006, 0.008  # behind the nearest point, at most this and this share of its depth
+CRACK_NEIGHBOURS = 5  # of eight, that close a crack
+FILL_RADIUS_PX = 3
+
+Splat = tuple[Float32[ndarray, "h w 3"], Float32[ndarray, "h w"]]  # colours 0..255, and their weight
+
+
+def warped_pictures(
+    case: Case, priors: Priors, empty: EmptyScene, heldout: HeldOut
+) -> Iterator[UInt8[ndarray, "h w 3"]]:
+    """Each recorded frame warped by its depth, with the warped empty scene where nothing lands; other holes filled."""
+    recorded = case.view.camera
+    for i, frame in enumerate(heldout.frames.tolist()):
+        target, source = heldout.camera.select([i]), recorded.select([frame])
+        colours, weight = closed(*splat(case.view.rgb[frame], priors.depth[frame], source, target))
+        behind, known = splat(empty.rgb, torch.where(empty.seen > 0, empty.depth, 0.0), source, target)
+        taken = (weight <= LEAST_WEIGHT) & (known > LEAST_WEIGHT)
+        colours[taken], weight[taken] = behind[taken], known[taken]
+        holes = (weight <= LEAST_WEIGHT).astype(np.uint8)
+        yield cv2.inpaint(colours.clip(0, 255).round().astype(np.uint8), holes, FILL_RADIUS_PX, cv2.INPAINT_TELEA)
+
+
+def splat(rgb: UInt8[Tensor, "h w 3"], depth: Float[Tensor, "h w"], source: CameraTrack, target: CameraTrack) -> Splat:
+    """Pixels of known depth (m) spread over the four nearest pixels of another view; the nearest surface wins."""
+    height, width = depth.shape
+    world = transform_points(source.world_from_camera[0], unproject_image(depth, source.intrinsics[0]).reshape(-1, 3))
+    xy, z = project(transform_points(target.camera_from_world[0], world), target.intrinsics[0])
+    valid = (depth.reshape(-1) > 0) & (z > 0)
+    at, z, values = xy[valid] - 0.5, z[valid], rgb.reshape(-1, 3)[valid].float()
+    low = at.floor()
+    corner = torch.tensor([[0, 0], [1, 0], [0, 1], [1, 1]])
+    cells = low.long()[:, None] + corner
+    share = (1 - (at[:, None] - low[:, None] - corner).abs()).prod(-1)
+    inside = ((cells >= 0) & (cells < torch.tensor([width, height]))).all(-1)
+    point, which = inside.nonzero(as_tuple=True)
+    cell = cells[point, which, 1] * width + cells[point, which, 0]
+    share, z = share[point, which], z[point]
+    nearest = torch.full((height * width,), torch.inf)
+    sure = share > LEAST_WEIGHT
+    nearest.scatter_reduce_(0, cell[sure], z[sure], "amin")
+    shown = z < nearest[cell] * (1 + SAME_SURFACE) + SAME_SURFACE_M
+    cell, share, point = cell[shown], share[shown], point[shown]
+    weight = torch.zeros(height * width).index_add_(0, cell, share)
+    total = torch.zeros(height * width, 3).index_add_(0, cell, share[:, None] * values[point])
+    colours = total / weight.clamp(min=1e-9)[:, None]
+    return colours.reshape(height, width, 3).numpy(), weight.reshape(height, width).numpy()
+
+
+def closed(colours: Float32[ndarray, "h w 3"], weight: Float32[ndarray, "h w"]) -> Splat:
+    """A splat whose cracks of a pixel or two are closed, so that nothing shines through them."""
+    for _ in range(2):
+        covered: Bool[ndarray, "h w"] = weight > LEAST_WEIGHT
+        window = {"ddepth": -1, "ksize": (3, 3), "normalize": False, "borderType": cv2.BORDER_CONSTANT}
+        count = cv2.boxFilter(covered.astype(np.float32), **window)
+        crack = ~covered & (count >= CRACK_NEIGHBOURS)
+        mean = cv2.boxFilter(np.where(covered[..., None], colours, np.float32(0)), **window)
+        colours = np.where(crack[..., None], mean / np.maximum(count, 1)[..., None], colours)
+        weight = np.where(crack, np.float32(1), weight)
+    return colours, weight
+
+
+def with_learned_motion(
+    scene: DynamicScene, distance: float, *, afresh: bool
+) -> tuple[DynamicScene, list[dict[str, Any]]]:
+    """A scene whose motion takes part in the fit, and the groups of parameters that Adam needs for that.
+
+    `afresh`: a deformation field begins without any motion (Yang et al. 2024, Deformable 3D Gaussians).
+    """
+    levels, groups = [], []
+    for level in scene.levels:
+        if isinstance(level, MotionLevel):
+            rates = {"rotations_6d": TURN_RATE, "displacements": SHIFT_RATE * distance}
+        else:
+            rates = dict.fromkeys(("first", "hidden", "biases", "last"), FIELD_RATE)
+            level = replace(level, last=torch.zeros_like(level.last)) if afresh else level
+        leaves = {name: getattr(level, name).clone().requires_grad_() for name in rates}
+        groups += [{"params": [leaf], "lr": rates[name]} for name, leaf in leaves.items()]
+        levels.append(replace(level, **leaves))
+    return replace(scene, levels=tuple(levels)), groups
+
+
+def with_fixed_motion(scene: DynamicScene) -> DynamicScene:
+    """The same scene after the fit: nothing is learned any more."""
+
+    def fixed(level: MotionLevel | DeformationField) -> MotionLevel | DeformationField:
+        return replace(level, **{name: value.detach() for name, value in vars(level).items()})
+
+    return replace(scene, levels=tuple(fixed(level) for level in scene.levels))
