@@ -39,6 +39,7 @@ from lerobot_msdyn.devices import chosen_device
 from lerobot_msdyn.episode import View, open_source, read_episode
 from lerobot_msdyn.fitting import FitResult, fit
 from lerobot_msdyn.pipeline import reconstruct
+from lerobot_msdyn.quality.witness import decibels
 from lerobot_msdyn.rendering import render_frames
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.dataset import write_dataset
@@ -176,7 +177,7 @@ def psnr(target: Device, options: argparse.Namespace) -> Iterator[dict]:
     for device in ("cpu", target.backend):
         config = _config(options, device)
         scene = reconstruct(View(seen.rgb, video.camera, seen.depth), config)
-        found[device] = scene.witnesses[0].psnr_db
+        found[device] = decibels(float(scene.witnesses[0].fitted_error.mean()))
         steps = scene.results[0].steps
         yield {"case": f"fit on {device}", "held-out dB": found[device], "ms per step": 1e3 * scene.seconds / steps}
     yield {"case": "difference", "held-out dB": found[target.backend] - found["cpu"]}

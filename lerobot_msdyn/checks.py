@@ -211,10 +211,8 @@ def _check_feature(key: object, feature: object, where: Path) -> None:
 
 
 def _is_numeric(dtype: object) -> bool:
-    try:
-        return isinstance(dtype, str) and np.dtype(dtype).kind in "biuf"
-    except TypeError:
-        return False
+    kind = np.sctypeDict.get(dtype) if isinstance(dtype, str) else None  # np.dtype would parse any text
+    return kind is not None and np.dtype(kind).kind in "biuf"
 
 
 def _check_encoder(name: str, info: dict[str, Any]) -> None:

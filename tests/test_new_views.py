@@ -8,7 +8,6 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
-from conftest import FRAMES, HEIGHT, WIDTH
 from lerobot.datasets import LeRobotDataset
 from test_augment import FAST, FRONT, SIDE, run
 
@@ -17,6 +16,8 @@ from lerobot_msdyn.provenance import read_unseen
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.dataset import write_dataset
 from lerobot_msdyn.synthetic.scene import SyntheticScene
+
+FRAMES, WIDTH, HEIGHT = 12, 64, 48  # of `desk`
 
 
 @pytest.fixture(scope="module")
