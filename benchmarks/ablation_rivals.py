@@ -108,6 +108,7 @@ def with_fixed_motion(scene: DynamicScene) -> DynamicScene:
     """The same scene after the fit: nothing is learned any more."""
 
     def fixed(level: MotionLevel | DeformationField) -> MotionLevel | DeformationField:
-        return replace(level, **{name: value.detach() for name, value in vars(level).items()})
+        tensors = {name: value for name, value in vars(level).items() if isinstance(value, Tensor)}
+        return replace(level, **{name: value.detach() for name, value in tensors.items()})
 
     return replace(scene, levels=tuple(fixed(level) for level in scene.levels))
