@@ -22,7 +22,7 @@ demo: setup
 	$(BIN)/python examples/01_demo.py
 
 test: setup
-	$(BIN)/python -m pytest $(TESTS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile $(TESTS)
 
 lint: setup
 	$(BIN)/ruff check .
