@@ -2,6 +2,7 @@
 
 import logging
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -72,3 +73,11 @@ def shared_data() -> Path:
 def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Priors are kept in a folder of the test run, not in the user's."""
     os.environ["LEROBOT_MSDYN_CACHE"] = str(tmp_path_factory.mktemp("cache"))
+
+
+@pytest.fixture(autouse=True)
+def _logging_as_before() -> Iterator[None]:
+    """Benchmarks silence all logging of their process."""
+    level = logging.root.manager.disable
+    yield
+    logging.disable(level)
