@@ -1,5 +1,6 @@
 """The rasterizer for CPUs: numba kernels with explicit SIMD, and their gradient, behind torch's autograd."""
 
+import threading
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +19,10 @@ from lerobot_msdyn.render.threads import run
 from lerobot_msdyn.render.tiles import TILE_HEIGHT, TILE_WIDTH
 from lerobot_msdyn.render.types import MAX_CPU_CHANNELS, Raster
 from lerobot_msdyn.render.validation import check_cameras, check_values
+
+_REUSED = 1 << 22  # numbers (16 MiB) up to which a thread holds on to memory
+_NONE = np.empty(0, np.float32)
+_local = threading.local()
 
 
 def rasterize_cpu(
@@ -92,12 +97,24 @@ def _arrays(*tensors: Tensor) -> list[np.ndarray]:
     return [tensor.detach().contiguous().numpy() for tensor in tensors]
 
 
-def _project(inputs: tuple[Tensor, ...], width: int, height: int, near: float) -> _Projected:
-    """Project and list per tile."""
+def _records(size: int, *, kept: bool) -> np.ndarray:
+    """Uninitialised float32; memory of this thread that its next call uses again, unless it is `kept`.
+
+    Fresh memory of this size costs more to get, page by page, than to fill.
+    """
+    if kept or size > _REUSED:
+        return np.empty(size, np.float32)
+    if getattr(_local, "records", _NONE).size < size:
+        _local.records = np.empty(size, np.float32)
+    return _local.records[:size]
+
+
+def _project(inputs: tuple[Tensor, ...], width: int, height: int, near: float, *, kept: bool) -> _Projected:
+    """Project and list per tile; `kept`: for the backward pass."""
     means, features, cameras = inputs[0], inputs[4], inputs[5]
     views, count, channels = cameras.shape[0], means.shape[1], features.shape[2]
     layout = layout_for(channels)
-    records = np.empty(views * count * layout.record, np.float32)
+    records = _records(views * count * layout.record, kept=kept)
     rects = np.empty((views, count, 4), np.int16)
     counts, depths = np.empty((views, count), np.int32), np.empty((views, count), np.float32)
     refused = np.zeros(1, np.int32)
@@ -123,7 +140,7 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
         inputs, (width, height, near) = arguments[:7], arguments[7:]
-        projected = _project(inputs, width, height, near)
+        projected = _project(inputs, width, height, near, kept=any(ctx.needs_input_grad))
         views, channels = inputs[5].shape[0], inputs[4].shape[2]
         image = torch.empty(views, channels, height, width)
         depth, alpha = torch.empty(views, height, width), torch.empty(views, height, width)

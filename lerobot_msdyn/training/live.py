@@ -36,7 +36,9 @@ class LiveScene:
     def __init__(self, scene: SavedScene) -> None:
         """Prepare every window."""
         self.scene = scene
-        self._windows = [_LiveWindow(window) for window in scene.windows]
+        ends = (*scene.starts[1:], len(scene))
+        parts = zip(scene.windows, scene.starts, ends, strict=True)
+        self._windows = [_LiveWindow(window, end - start) for window, start, end in parts]
 
     @property
     def size_in_bytes(self) -> int:
@@ -63,7 +65,7 @@ class LiveScene:
 class _LiveWindow:
     """One window's Gaussians in buffers whose static part is written once; behind them there is room for a patch."""
 
-    def __init__(self, scene: DynamicScene) -> None:
+    def __init__(self, scene: DynamicScene, frames: int) -> None:
         static, moving = scene.static, scene.moving
         self._scene, self._static, self._own = scene, len(static), len(static) + len(moving)
         self._static_rgb = static.rgb
@@ -77,13 +79,15 @@ class _LiveWindow:
         self._levels = [i for i, level in enumerate(scene.levels) if not _is_idle(level)]
         self._posable = all(isinstance(scene.levels[i], MotionLevel) for i in self._levels)
         if self._posable:
-            self._prepare_bases()
+            self._prepare_bases(torch.arange(frames))
 
-    def _prepare_bases(self) -> None:
-        """One table for the bases of all levels."""
+    def _prepare_bases(self, times: Int[Tensor, " t"]) -> None:
+        """One table for the bases of all levels, at all frames."""
         scene, count = self._scene, len(self._scene.moving)
-        sizes = [len(level) for level in map(scene.levels.__getitem__, self._levels) if isinstance(level, MotionLevel)]
-        firsts: np.ndarray = np.cumsum([0, *sizes])
+        levels = [scene.levels[i] for i in self._levels]
+        maps = [level_affines(level, times).transpose(0, 1) for level in levels if isinstance(level, MotionLevel)]
+        self._affines = torch.cat([torch.zeros(len(times), 0, 3, 4), *maps], dim=1).contiguous()
+        firsts: np.ndarray = np.cumsum([0, *(part.shape[1] for part in maps)])
         indices = [scene.indices[i].numpy() + first for i, first in zip(self._levels, firsts[:-1], strict=True)]
         weights = [scene.logits[i].softmax(dim=-1).numpy() for i in self._levels]
         none = np.zeros((count, 0))
@@ -95,16 +99,9 @@ class _LiveWindow:
     @property
     def size_in_bytes(self) -> int:
         """Memory of the buffers."""
-        tensors = (
-            self._static_rgb,
-            self._scales,
-            self._opacities,
-            self._shown,
-            self._means,
-            self._quats,
-            self._rgb,
-        )
-        return sum(tensor.nbytes for tensor in tensors)
+        shown = (self._static_rgb, self._scales, self._opacities, self._shown, self._means, self._quats, self._rgb)
+        bases = (self._affines, self._indices, self._weights, self._sh) if self._posable else ()
+        return sum(array.nbytes for array in (*shown, *bases))
 
     @torch.no_grad()
     def draw(self, camera: CameraTrack, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -157,14 +154,11 @@ class _LiveWindow:
                 buffer[moving] = values[0, moving]
             self._rgb[moving] = snapshot.rgb[0, moving]
             return
-        levels = [self._scene.levels[i] for i in self._levels]
-        maps = [level_affines(level, time)[:, 0] for level in levels if isinstance(level, MotionLevel)]
-        affines = torch.cat([torch.zeros(0, 3, 4), *maps])
         pose(
             self._scene.moving.means.numpy(),
             self._scene.moving.quats.numpy(),
             self._sh,
-            affines.numpy(),
+            self._affines[int(time)].numpy(),
             self._indices,
             self._weights,
             self._bounds,
