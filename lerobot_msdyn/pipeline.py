@@ -18,6 +18,7 @@ from lerobot_msdyn.cameras import concatenated, read_calibration
 from lerobot_msdyn.config import OtherCameraConfig, Recipe, SceneConfig
 from lerobot_msdyn.coverage import Evidence, evidence_of
 from lerobot_msdyn.devices import chosen_device
+from lerobot_msdyn.enlarging import enlarged
 from lerobot_msdyn.episode import View, depth_key_of, read_episode, shrink
 from lerobot_msdyn.errors import ConfigError
 from lerobot_msdyn.fitting import FitResult, fit
@@ -261,7 +262,7 @@ def _fit_window(
     device = chosen_device(recipe.device)
     steps, settings = recipe.fit.steps, recipe.scene
     recorded_width, view = view.rgb.shape[2], shrink(view, recipe.fit.max_width)
-    enlarged = recorded_width > view.rgb.shape[2]
+    ratio = recorded_width / view.rgb.shape[2]
     with torch_on_one_thread():
         shared = next((background for background in backgrounds if background.fits(view)), None)
         priors = priors_of(view, elsewhere=None if shared is None else shared.frames)
@@ -292,9 +293,10 @@ def _fit_window(
         )
         seen = evidence_of(result.scene, view.camera, empty)
         if settings.overlay:
-            overlay = unexplained(result.scene, view, priors, enlarged=enlarged)
+            overlay = unexplained(result.scene, view, priors, enlarged=ratio > 1)
             result = replace(result, scene=replace(result.scene, overlay=overlay))
         said = witness(result.scene, view, priors, result.held_out)
+        result = replace(result, scene=enlarged(result.scene, view.camera, ratio))
         result, seen = to_device((result, seen), "cpu")
     return result, priors, distance, seen, said
 
