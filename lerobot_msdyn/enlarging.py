@@ -4,11 +4,12 @@ import math
 from dataclasses import replace
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from lerobot_msdyn.cameras import CameraTrack
-from lerobot_msdyn.geometry import transform_points
 from lerobot_msdyn.render.types import COVARIANCE_BLUR
-from lerobot_msdyn.scene import DynamicScene, Gaussians
+from lerobot_msdyn.scene import DynamicScene
 
 
 def enlarged(scene: DynamicScene, camera: CameraTrack, ratio: float) -> DynamicScene:
@@ -19,21 +20,34 @@ def enlarged(scene: DynamicScene, camera: CameraTrack, ratio: float) -> DynamicS
     is added to the Gaussians themselves (as the 3D filter of Mip-Splatting, Yu et al. 2024, for another end).
 
     Args:
-        scene: fitted; its overlay stays as it is (`unexplained` makes it for larger pictures where they are wanted).
+        scene: fitted.
         camera: through which it was fitted, at that size. The moving set is taken to be as far off at all times as its
             canonical positions are from the first pose.
         ratio: width of the larger pictures to that of the fitted ones; up to 1 nothing is changed.
     """
     if ratio <= 1:
         return scene
-    variance_px = COVARIANCE_BLUR * (1 - ratio**-2)
-    static, moving = (_widened(part, camera, variance_px) for part in (scene.static, scene.moving))
-    return replace(scene, static=static, moving=moving)
+    added_px = math.sqrt(COVARIANCE_BLUR * (1 - ratio**-2))
+    added = added_px / float(camera.intrinsics[0].diagonal()[:2].mean())  # of the depth
+    poses = camera.camera_from_world.to(scene.device)
+    static, moving = (
+        replace(part, log_scales=_widened(part.log_scales, added * _depth(part.means, poses[:1])))
+        for part in (scene.static, scene.moving)
+    )
+    overlay = scene.overlay
+    if overlay is not None:
+        frame = torch.repeat_interleave(torch.arange(len(overlay.first) - 1), overlay.first.diff().cpu())
+        depth = _depth(overlay.means, poses.to(overlay.means.device)[frame])
+        wider = _widened(overlay.log_scales.float(), added * depth).to(overlay.log_scales)
+        overlay = replace(overlay, log_scales=wider)
+    return replace(scene, static=static, moving=moving, overlay=overlay)
 
 
-def _widened(gaussians: Gaussians, camera: CameraTrack, variance_px: float) -> Gaussians:
-    """The same with a variance (px²) added along all axes; what is behind the camera stays as it is."""
-    pose, focal_px = camera.camera_from_world[0].to(gaussians.means), float(camera.intrinsics[0].diagonal()[:2].mean())
-    depth = transform_points(pose, gaussians.means)[:, 2:].clamp(min=0)  # m
-    added = math.sqrt(variance_px) / focal_px * depth
-    return replace(gaussians, log_scales=torch.logaddexp(2 * gaussians.log_scales, 2 * added.log()) / 2)
+def _depth(means: Float[Tensor, "n 3"], poses: Float[Tensor, "#n 4 4"]) -> Float[Tensor, " n"]:
+    """Distances (m) along the line of sight; 0 behind the camera."""
+    return ((means * poses[:, 2, :3]).sum(-1) + poses[:, 2, 3]).clamp(min=0)
+
+
+def _widened(log_scales: Float[Tensor, "n s"], added: Float[Tensor, " n"]) -> Float[Tensor, "n s"]:
+    """Scales after the square of a standard deviation (m) is added to the variance along all axes."""
+    return torch.logaddexp(2 * log_scales, 2 * added.log()[:, None]) / 2

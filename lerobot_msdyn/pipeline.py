@@ -293,7 +293,7 @@ def _fit_window(
         )
         seen = evidence_of(result.scene, view.camera, empty)
         if settings.overlay:
-            overlay = unexplained(result.scene, view, priors, enlarged=ratio > 1)
+            overlay = unexplained(result.scene, view, priors)
             result = replace(result, scene=replace(result.scene, overlay=overlay))
         said = witness(result.scene, view, priors, result.held_out)
         result = replace(result, scene=enlarged(result.scene, view.camera, ratio))

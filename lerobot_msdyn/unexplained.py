@@ -27,15 +27,12 @@ DEPTH_ERROR = 0.02  # relative difference of depths beyond which it is not, at l
 JUMP = 0.05  # relative step of depth to the surface in front, beyond which a pixel belongs to the one behind
 THICKNESS = 0.03  # share of the depth within which a Gaussian belongs to the recorded surface
 SCALE = 0.7  # of a pixel's Gaussian: its neighbours are drawn as well
-ENLARGED_SCALE = 1.0  # where pictures are drawn larger than they were fitted, and gaps would open between them
 ERROR_AROUND = 0.04  # the same over several pixels of the moving set, all of which it then condemns
 _SMOOTH_PX, _AROUND_PX = 1.0, 8.0
 _BESIDE = np.ones((3, 3), np.uint8)  # a pixel and those beside it
 
 
-def unexplained(
-    scene: DynamicScene, view: View, priors: Priors, backend: str = "auto", *, enlarged: bool = False
-) -> Overlay:
+def unexplained(scene: DynamicScene, view: View, priors: Priors, backend: str = "auto") -> Overlay:
     """The patches of all frames that make the recorded camera see what it recorded (docs/fit.md, "Overlay").
 
     A pixel is unexplained where the drawn picture has another colour or depth than the recorded one. There the frame's
@@ -48,9 +45,7 @@ def unexplained(
         view: the video, at the size at which it was fitted.
         priors: its depth.
         backend: of the rasterizer.
-        enlarged: whether the scene will be drawn at a larger size than the view's.
     """
-    scale = ENLARGED_SCALE if enlarged else SCALE
     patches, still, tolerance = [], None, depth_tolerance(priors)
     for frame in range(len(view.rgb)):
         camera, when = view.camera.select([frame]), torch.tensor([frame])
@@ -60,7 +55,7 @@ def unexplained(
         drawn = to_device(draw(scene, camera, when, backend), "cpu")
         wrong = _wrong(drawn, view.rgb[frame].float() / 255, depth.numpy(), tolerance)
         taken = wrong & ~_behind_an_edge(depth.numpy(), still.numpy())
-        patches.append(_patch(scene, view, depth, frame, wrong, taken, scale, backend))
+        patches.append(_patch(scene, view, depth, frame, wrong, taken, backend))
     overlay = packed(patches)
     share = len(overlay.means) / max(priors.depth.numel(), 1)
     logger.info("overlay: %.1f %% of the recorded pixels are not explained and shown as recorded", 100 * share)
@@ -116,7 +111,6 @@ def _patch(
     frame: int,
     wrong: Bool[ndarray, "h w"],
     taken: Bool[ndarray, "h w"],
-    scale: float,
     backend: str,
 ) -> FramePatch:
     """The pixels that are taken as Gaussians, with colours that make the drawn picture the recorded one."""
@@ -124,7 +118,7 @@ def _patch(
     chosen = torch.from_numpy(taken).reshape(-1)
     pixels = pixel_gaussians(view.rgb[frame], depth, view.camera, frame)[0].select(chosen)
     hidden = _hidden(scene, camera, when, depth, torch.from_numpy(wrong), torch.from_numpy(taken))
-    log_scales, recorded = pixels.log_scales + math.log(scale), view.rgb[frame].reshape(-1, 3)[chosen].float() / 255
+    log_scales, recorded = pixels.log_scales + math.log(SCALE), view.rgb[frame].reshape(-1, 3)[chosen].float() / 255
     first = FramePatch(pixels.means, pixels.quats, log_scales, recorded, hidden)
     if len(first) == 0:
         return first

@@ -9,6 +9,7 @@ from lerobot_msdyn.background import background_gaussians
 from lerobot_msdyn.cameras import CameraTrack, intrinsics_from_fov, static_camera
 from lerobot_msdyn.enlarging import enlarged
 from lerobot_msdyn.motion.bases import identity_level
+from lerobot_msdyn.overlay import FramePatch, packed
 from lerobot_msdyn.rendering import draw
 from lerobot_msdyn.scene import DynamicScene, isotropic
 
@@ -56,6 +57,17 @@ def test_isotropic_gaussians_stay_so(wall: DynamicScene, camera: CameraTrack) ->
 
 def test_nothing_changes_at_the_fitted_size(wall: DynamicScene, camera: CameraTrack) -> None:
     assert enlarged(wall, camera, 1.0) is wall
+
+
+def test_overlays_grow_as_the_rest_does(wall: DynamicScene, camera: CameraTrack) -> None:
+    static = wall.static
+    shown = FramePatch(
+        static.means, static.quats, static.log_scales, static.rgb, torch.ones(len(static), dtype=torch.bool)
+    )
+    larger = enlarged(dataclasses.replace(wall, overlay=packed([shown])), camera, RATIO)
+    assert larger.overlay is not None
+    assert torch.allclose(larger.overlay.log_scales.float(), larger.static.log_scales, atol=0.01)
+    assert inside(larger, camera, RATIO).std() < 0.02
 
 
 def test_behind_the_camera_nothing_grows(wall: DynamicScene, camera: CameraTrack) -> None:
