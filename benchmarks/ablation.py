@@ -194,7 +194,7 @@ def cases(options: argparse.Namespace, settings: Settings) -> Iterator[tuple[str
                 kind,
                 seed,
                 lambda kind=kind, seed=seed: synthetic_case(
-                    kind, seed, settings.frames, settings.width, settings.every
+                    kind, seed, settings.frames, settings.width, settings.every, true_priors=options.true_priors
                 ),
             )
     for scene in options.scenes if options.sim and not options.true_priors else ():

@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import logging
+import sys
 from collections.abc import Callable, Generator
 from dataclasses import replace
 
@@ -23,6 +24,8 @@ from lerobot_msdyn.write import NewEpisode, OutputDataset
 
 logger = logging.getLogger(__name__)
 
+UNWATCHED_S = 30.0  # between updates of a progress bar that nobody watches
+
 
 def run_local(
     source: LeRobotDatasetMetadata,
@@ -38,14 +41,16 @@ def run_local(
     new: list[NewEpisode] = []
     failures: list[EpisodeError] = []
     bar_format = "{desc} |{bar}| {percentage:3.0f} % of {total} episodes [{elapsed}<{remaining}]"
-    with logging_redirect_tqdm(), tqdm(total=len(episodes), bar_format=bar_format) as bar:
+    watched = sys.stderr.isatty()  # in a file a bar has a line per update
+    interval_s = 0.1 if watched else UNWATCHED_S
+    with logging_redirect_tqdm(), tqdm(total=len(episodes), bar_format=bar_format, mininterval=interval_s) as bar:
 
         def progress(what: str, share: float) -> None:
             if what:
-                bar.set_description_str(what)
+                bar.set_description_str(what, refresh=watched)
             bar.update(min(share, len(episodes) - bar.n))  # shares add up to one only up to rounding
 
-        bar.set_description_str("looking at the background")
+        bar.set_description_str("looking at the background", refresh=watched)
         work = Work(source, cameras, config, output, progress)
         with contextlib.closing(_attempts(work, episodes)) as attempts:  # workers end before the lock is let go
             for index, failure in zip(episodes, attempts, strict=True):

@@ -26,6 +26,7 @@ from lerobot_msdyn.initialisation import initialise
 from lerobot_msdyn.perturbation import look_at_distance
 from lerobot_msdyn.priors import Priors, estimate_priors
 from lerobot_msdyn.provenance import SOURCE_VARIANT, Provenance, camera_pose, merged
+from lerobot_msdyn.pruning import without_disproved
 from lerobot_msdyn.quality.verdict import judge, reasons, record
 from lerobot_msdyn.quality.witness import Witness, witness
 from lerobot_msdyn.render.threads import torch_on_one_thread
@@ -271,7 +272,8 @@ def _fit_window(
             shared = None
         if not view.camera.is_static:
             logger.warning("the camera moves, but the empty scene is built as if it were fixed: expect blur")
-        if priors.provenance["depth"]["provider"] not in SHARP_DEPTH:
+        rough = priors.provenance["depth"]["provider"] not in SHARP_DEPTH
+        if rough:
             settings = _for_rough_depth(settings)
         empty = empty_scene(view.rgb, priors.depth, priors.instances)
         if shared is not None:
@@ -291,6 +293,8 @@ def _fit_window(
             seed=recipe.seed,
             progress=lambda done: progress(done / steps),
         )
+        if rough:
+            result = replace(result, scene=without_disproved(result.scene, view))
         seen = evidence_of(result.scene, view.camera, empty)
         if settings.overlay:
             overlay = unexplained(result.scene, view, priors)

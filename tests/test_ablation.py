@@ -114,6 +114,8 @@ def test_a_run_goes_on_where_it_was_stopped(ablation: ModuleType, tmp_path: Path
     assert after[0]["cpu_s"] == -1.0
     assert [one["row"] for one in after] == ["source picture", "warp + background", "the method with overlay"]
     assert all(5 < one[name] < 60 for one in after for name in ("all", "moving", "disoccluded"))
+    ablation.main([*first, "--true_priors"])
+    assert [one["priors"] for one in json.loads(path.read_text())["figures"]] == ["own", "own", "own", "true"]
     with pytest.raises(SystemExit, match="choose another --json"):
         ablation.main([*first, "--steps", "5"])
 
