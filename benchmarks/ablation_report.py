@@ -7,7 +7,7 @@ from typing import Any
 
 MEASURES = ("all", "moving", "disoccluded")
 REFERENCE = "L1-L3"  # with which every row is compared, case by case
-LINE_PX, LEFT_PX, WIDTH_PX, TOP_PX, MARGIN_PX = 24, 190, 720, 46, 22
+LINE_PX, LEFT_PX, WIDTH_PX, TOP_PX, MARGIN_PX = 24, 205, 720, 46, 22
 MADE_UP, SIMULATED = "#1f5fa8", "#c8641b"
 
 Figures = Sequence[dict[str, Any]]
