@@ -148,7 +148,7 @@ def reconstructed(known: Prepared, row: Row, recipe: Recipe) -> Reconstruction:
     result = replace(result, scene=with_fixed_motion(result.scene))
     evidence = evidence_of(result.scene, view.camera, known.empty)
     if recipe.scene.overlay:
-        overlay = unexplained(result.scene, view, priors, enlarged=False)
+        overlay = unexplained(result.scene, view, priors)
         result = replace(result, scene=replace(result.scene, overlay=overlay))
     return Reconstruction((result,), (0,), priors.metric, {}, view.camera, distance, (evidence,), ())
 
