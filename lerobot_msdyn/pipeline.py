@@ -272,8 +272,8 @@ def _fit_window(
             shared = None
         if not view.camera.is_static:
             logger.warning("the camera moves, but the empty scene is built as if it were fixed: expect blur")
-        rough = priors.provenance["depth"]["provider"] not in SHARP_DEPTH
-        if rough:
+        provider = priors.provenance["depth"]["provider"]
+        if provider not in SHARP_DEPTH:
             settings = _for_rough_depth(settings)
         empty = empty_scene(view.rgb, priors.depth, priors.instances)
         if shared is not None:
@@ -293,7 +293,7 @@ def _fit_window(
             seed=recipe.seed,
             progress=lambda done: progress(done / steps),
         )
-        if rough:
+        if provider != "recorded":
             result = replace(result, scene=without_disproved(result.scene, view))
         seen = evidence_of(result.scene, view.camera, empty)
         if settings.overlay:
