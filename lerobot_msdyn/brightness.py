@@ -10,7 +10,7 @@ from torch import Tensor
 from lerobot_msdyn.episode import View
 from lerobot_msdyn.geometry import project, transform_points
 from lerobot_msdyn.priors import Priors
-from lerobot_msdyn.rendering import draw
+from lerobot_msdyn.rendering import draw, landed
 from lerobot_msdyn.scene import DynamicScene, Gaussians
 from lerobot_msdyn.shading import Shading, encode_gain, no_shading
 from lerobot_msdyn.values import to_device
@@ -20,7 +20,6 @@ FIELD_STEP = 2  # px of the fitted image per pixel of the field of gains
 MASK_MARGIN_PX = 2  # colours of what moves bleed this far
 FLOOR = 4.0  # grey levels added to both sides of a ratio: noise in the dark is no gain
 SURE_WEIGHT = 0.5  # share of the blur's window that must be known
-NEAR = 0.01  # a Gaussian counts as seen up to this share of its depth behind the drawn surface
 MOVING_STEP = 2  # the moving set is measured at every second frame, and over three of these
 
 
@@ -113,12 +112,9 @@ def _seen_sums(scene: DynamicScene, view: View, priors: Priors, frame: int, back
     recorded, shown = _grey(view.rgb[frame].numpy()), _grey(255 * drawn.rgb[0].numpy())
     sums = torch.from_numpy(_blurred_sums(recorded, shown, usable))
     means = scene.at(when).means[0, len(scene.static) :].cpu()
-    xy, z = project(transform_points(camera.camera_from_world[0], means), camera.intrinsics[0])
-    column, row = xy.floor().long().unbind(-1)
-    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height) & (z > 0)
-    column, row = column.clamp(0, camera.width - 1), row.clamp(0, camera.height - 1)
+    row, column, visible = landed(means, camera, drawn.depth[0])
     own = sums[row, column]
-    seen = inside & (z < (1 + NEAR) * drawn.depth[0, row, column]) & (own[:, 2] > SURE_WEIGHT)
+    seen = visible & (own[:, 2] > SURE_WEIGHT)
     return own[:, :2] * seen[:, None]
 
 

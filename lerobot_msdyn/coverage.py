@@ -15,12 +15,11 @@ from torch import Tensor
 from lerobot_msdyn.background import EmptyScene, fill_depth
 from lerobot_msdyn.cameras import CameraTrack
 from lerobot_msdyn.geometry import project, transform_points, unproject_image
-from lerobot_msdyn.rendering import Rendering, draw
+from lerobot_msdyn.rendering import BEHIND, Rendering, draw
 from lerobot_msdyn.scene import DynamicScene
 from lerobot_msdyn.values import to_device
 
 HOLE_ALPHA = 0.5  # below this opacity nothing is known to be there
-BEHIND = 0.01  # share of its depth by which a point may lie behind a recorded surface and still be that surface
 SAMPLES = 12  # frames in which the moving Gaussians are looked for
 
 

@@ -1,7 +1,6 @@
 """Moving Gaussians that the video disproves are taken out of a fitted scene."""
 
 import logging
-from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -9,8 +8,7 @@ from torch import Tensor
 
 from lerobot_msdyn.cameras import CameraTrack
 from lerobot_msdyn.episode import View
-from lerobot_msdyn.geometry import project, transform_points
-from lerobot_msdyn.rendering import draw
+from lerobot_msdyn.rendering import draw, landed
 from lerobot_msdyn.scene import DynamicScene
 from lerobot_msdyn.values import to_device
 
@@ -19,7 +17,6 @@ logger = logging.getLogger(__name__)
 SAMPLES = 40  # frames that are compared
 COLOUR_ERROR = 0.08  # mean absolute difference of colours 0..1, to the most similar of nine pixels
 MOST_WRONG = 0.4  # share of the frames in which it is to be seen in which a Gaussian may have another colour
-FRONT = 0.01  # share of the drawn depth by which a Gaussian may lie behind it and still be what is seen
 
 
 @torch.no_grad()
@@ -46,14 +43,7 @@ def without_disproved(scene: DynamicScene, view: View) -> DynamicScene:
         wrong += visible & differs
     kept = wrong <= MOST_WRONG * seen
     logger.info("%d of %d moving Gaussians disproved by the video", count - int(kept.sum()), count)
-    shading = scene.shading
-    return replace(
-        scene,
-        moving=scene.moving.select(kept),
-        indices=tuple(rows[kept] for rows in scene.indices),
-        logits=tuple(rows[kept] for rows in scene.logits),
-        shading=None if shading is None else replace(shading, moving=shading.moving[:, kept]),
-    )
+    return scene.select_moving(kept)
 
 
 def _compared(
@@ -62,13 +52,9 @@ def _compared(
     """Which of the moving set are to be seen at a frame, and which have another colour than the pixels there."""
     snapshot = scene.at(frame, camera.world_from_camera[:, :3, 3])
     means, colours = snapshot.means[0, len(scene.static) :], snapshot.rgb[0, len(scene.static) :]
-    xy, z = project(transform_points(camera.camera_from_world[0], means), camera.intrinsics[0])
+    row, column, visible = landed(means, camera, draw(scene, camera, frame).depth[0])
     height, width = recorded.shape[:2]
-    inside = (z > 0) & (xy >= 0).all(-1) & (xy[:, 0] < width) & (xy[:, 1] < height)
-    column, row = torch.nan_to_num(xy).long().unbind(-1)
-    column, row = column.clamp(0, width - 1), row.clamp(0, height - 1)
-    visible = inside & (z <= (1 + FRONT) * draw(scene, camera, frame).depth[0, row, column])
-    error = torch.full_like(z, float("inf"))
+    error = torch.full_like(means[:, 0], float("inf"))
     for down in (-1, 0, 1):
         for right in (-1, 0, 1):
             pixel = recorded[(row + down).clamp(0, height - 1), (column + right).clamp(0, width - 1)]

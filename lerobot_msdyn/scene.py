@@ -141,11 +141,15 @@ class DynamicScene:
         """Where its tensors are."""
         return self.static.means.device
 
+    def select_moving(self, which: Tensor | slice) -> "DynamicScene":
+        """The same with some Gaussians of the moving set, by index, mask or slice; of a scene without an overlay."""
+        shading = None if self.shading is None else replace(self.shading, moving=self.shading.moving[:, which])
+        indices, logits = (tuple(rows[which] for rows in levels) for levels in (self.indices, self.logits))
+        return replace(self, moving=self.moving.select(which), indices=indices, logits=logits, shading=shading)
+
     def still(self) -> "DynamicScene":
         """The same without what moves and without an overlay: the static set, its brightness and the near plane."""
-        shading = None if self.shading is None else replace(self.shading, moving=self.shading.moving[:, :0])
-        nothing = self.moving.select(slice(0))
-        return replace(self, moving=nothing, levels=(), indices=(), logits=(), shading=shading, overlay=None)
+        return replace(self.select_moving(slice(0)), levels=(), indices=(), logits=(), overlay=None)
 
     def at(self, frames: Int[Tensor, " b"], eye: Float[Tensor, "b 3"] | None = None) -> Snapshot:
         """The scene at some frames, differentiable in all Gaussians and bases.

@@ -36,9 +36,7 @@ class LiveScene:
     def __init__(self, scene: SavedScene) -> None:
         """Prepare every window."""
         self.scene = scene
-        ends = (*scene.starts[1:], len(scene))
-        parts = zip(scene.windows, scene.starts, ends, strict=True)
-        self._windows = [_LiveWindow(window, end - start) for window, start, end in parts]
+        self._windows = [_LiveWindow(window) for window in scene.windows]
 
     @property
     def size_in_bytes(self) -> int:
@@ -65,7 +63,7 @@ class LiveScene:
 class _LiveWindow:
     """One window's Gaussians in buffers whose static part is written once; behind them there is room for a patch."""
 
-    def __init__(self, scene: DynamicScene, frames: int) -> None:
+    def __init__(self, scene: DynamicScene) -> None:
         static, moving = scene.static, scene.moving
         self._scene, self._static, self._own = scene, len(static), len(static) + len(moving)
         self._static_rgb = static.rgb
@@ -79,11 +77,12 @@ class _LiveWindow:
         self._levels = [i for i, level in enumerate(scene.levels) if not _is_idle(level)]
         self._posable = all(isinstance(scene.levels[i], MotionLevel) for i in self._levels)
         if self._posable:
-            self._prepare_bases(torch.arange(frames))
+            self._prepare_bases()
 
-    def _prepare_bases(self, times: Int[Tensor, " t"]) -> None:
+    def _prepare_bases(self) -> None:
         """One table for the bases of all levels, at all frames."""
         scene, count = self._scene, len(self._scene.moving)
+        times = torch.arange(scene.frames)
         levels = [scene.levels[i] for i in self._levels]
         maps = [level_affines(level, times).transpose(0, 1) for level in levels if isinstance(level, MotionLevel)]
         self._affines = torch.cat([torch.zeros(len(times), 0, 3, 4), *maps], dim=1).contiguous()
