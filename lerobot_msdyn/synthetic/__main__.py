@@ -37,6 +37,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--width", type=int, default=160, help="px")
     parser.add_argument("--height", type=int, default=120, help="px")
     parser.add_argument("--fps", type=int, default=30)
+    parser.add_argument("--sway_deg", type=float, default=4.0, help="of the camera, to either side (layout iphone)")
     parser.add_argument("--seed", type=int, default=0, help="decides the desk's textures and clutter")
     return parser
 
@@ -53,7 +54,7 @@ def main(arguments: list[str] | None = None) -> int:
         elif a.layout == "nvs":
             write_nvs_folder(scenes[0], a.out)
         else:
-            write_iphone_folder(scenes[0], a.out)
+            write_iphone_folder(scenes[0], a.out, sway_deg=a.sway_deg)
     except MsdynError as error:
         logger.error("%s: %s", type(error).__name__, error)
         return 2

@@ -30,8 +30,8 @@ PROCESSED = "flow3d_preprocessed"
 PINHOLE = 1  # COLMAP's number of that camera model
 
 
-def write_iphone_folder(scene: SyntheticScene, root: Path, every: int = 5) -> None:
-    """Writes one sequence; every `every`-th frame is seen by the validation cameras.
+def write_iphone_folder(scene: SyntheticScene, root: Path, every: int = 5, sway_deg: float = 4.0) -> None:
+    """Writes one sequence by a camera that sways by `sway_deg`; the validation cameras see every `every`-th frame.
 
     Raises:
         ConfigError: `every` is not positive, or the size is odd, so that there is no 2x.
@@ -42,7 +42,7 @@ def write_iphone_folder(scene: SyntheticScene, root: Path, every: int = 5) -> No
         raise ConfigError(f"every must be at least 1 frame and the size even; got {every} and {width}x{height}")
     if root.exists():
         raise OutputError(f"{root} exists already; remove it or choose another folder for the sequence")
-    hand_held = hand_held_camera(len(scene), width, height)
+    hand_held = hand_held_camera(len(scene), width, height, sway_deg)
     frames = list(range(0, len(scene), every))
     still = heldout_cameras(len(frames), width, height)
     sights = [Sight(0, hand_held, list(range(len(scene))))]

@@ -15,6 +15,7 @@ from lerobot_msdyn.config import Protocol
 from lerobot_msdyn.errors import DatasetError
 from lerobot_msdyn.evaluation.iphone import read_sequence
 from lerobot_msdyn.evaluation.iphone_priors import read_priors
+from lerobot_msdyn.synthetic.iphone import write_iphone_folder
 from lerobot_msdyn.synthetic.scene import SyntheticScene
 from lerobot_msdyn.synthetic.viewpoints import hand_held_camera, heldout_cameras
 
@@ -44,6 +45,13 @@ def test_what_is_read_is_what_was_written(
     assert 0.6 < found.covisible("2_00005").mean() <= 1
     assert found.view.depth is not None
     torch.testing.assert_close(found.view.depth, push.render(hand_held).depth)
+
+
+def test_the_camera_sways_as_far_as_is_asked(push: SyntheticScene, tmp_path: Path) -> None:
+    write_iphone_folder(push, tmp_path / "seq", sway_deg=20.0)
+    found = read_sequence(tmp_path / "seq", "dycheck").view.camera.world_from_camera
+    wanted = hand_held_camera(FRAMES, WIDTH, HEIGHT, 20.0).world_from_camera
+    torch.testing.assert_close(found, wanted, atol=1e-5, rtol=0)
 
 
 def test_priors_of_the_package(sequence: Path, push: SyntheticScene) -> None:
