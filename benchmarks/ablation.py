@@ -38,19 +38,19 @@ from ablation_scenes import Case, HeldOut, simulated_case, synthetic_case
 from jaxtyping import UInt8
 from numpy import ndarray
 
-from lerobot_msdyn.background import EmptyScene, empty_scene
-from lerobot_msdyn.config import Recipe
-from lerobot_msdyn.coverage import evidence_of
-from lerobot_msdyn.evaluation.metrics import masked_psnr_db
-from lerobot_msdyn.files import write_whole
-from lerobot_msdyn.fitting import fit
-from lerobot_msdyn.initialisation import initialise
-from lerobot_msdyn.perturbation import look_at_distance
+from lerobot_msdyn.core.config import Recipe
+from lerobot_msdyn.core.files import write_whole
+from lerobot_msdyn.evaluate.metrics import masked_psnr_db
 from lerobot_msdyn.priors import Priors, estimate_priors
-from lerobot_msdyn.render.threads import torch_on_one_thread
-from lerobot_msdyn.sharing import NEAR
-from lerobot_msdyn.unexplained import unexplained
-from lerobot_msdyn.views import Reconstruction, new_pictures
+from lerobot_msdyn.reconstruct.background import EmptyScene, empty_scene
+from lerobot_msdyn.reconstruct.fit import fit
+from lerobot_msdyn.reconstruct.initialise import initialise
+from lerobot_msdyn.reconstruct.make_overlay import unexplained
+from lerobot_msdyn.reconstruct.share_background import NEAR
+from lerobot_msdyn.render.cpu.threads import torch_on_one_thread
+from lerobot_msdyn.views.coverage import evidence_of
+from lerobot_msdyn.views.perturbation import look_at_distance
+from lerobot_msdyn.views.pictures import Reconstruction, new_pictures
 
 JSON = Path(__file__).with_suffix(".json")
 PLOT = Path(__file__).parent.parent / "docs" / "images" / "ablation.svg"

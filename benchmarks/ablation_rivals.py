@@ -12,13 +12,13 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from lerobot_msdyn.background import EmptyScene
-from lerobot_msdyn.cameras import CameraTrack
-from lerobot_msdyn.geometry import project, transform_points, unproject_image
-from lerobot_msdyn.motion.bases import MotionLevel
+from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.geometry import project, transform_points, unproject_image
 from lerobot_msdyn.motion.field import DeformationField
+from lerobot_msdyn.motion.model.bases import MotionLevel
 from lerobot_msdyn.priors import Priors
-from lerobot_msdyn.scene import DynamicScene
+from lerobot_msdyn.reconstruct.background import EmptyScene
+from lerobot_msdyn.scene.gaussians import DynamicScene
 
 FIELD_RATE = 1e-3  # of a deformation field's layers
 TURN_RATE, SHIFT_RATE = 1e-3, 1e-4  # of the bases' knots; shifts in units of the look-at distance

@@ -12,8 +12,8 @@ from jaxtyping import Bool, Int, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from lerobot_msdyn.cameras import CameraTrack
-from lerobot_msdyn.episode import View
+from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.dataset.read import View
 from lerobot_msdyn.priors import PointTracks
 from lerobot_msdyn.synthetic import SyntheticScene, covisibility, heldout_cameras, make_scene
 

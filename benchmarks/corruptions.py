@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float
 from numpy import ndarray
 
-from lerobot_msdyn.cameras import CameraTrack
-from lerobot_msdyn.config import Recipe
-from lerobot_msdyn.episode import View, open_source, read_episode, select_cameras, shrink
+from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.config import Recipe
+from lerobot_msdyn.dataset.read import View, open_source, read_episode, select_cameras, shrink
 from lerobot_msdyn.priors import Priors, estimate_priors
 from lerobot_msdyn.priors.exchange import from_priors, write_exchange
 

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_msdyn import evaluate
-from lerobot_msdyn.cli import run_command
-from lerobot_msdyn.errors import ConfigError
+from lerobot_msdyn.core.cli import run_command
+from lerobot_msdyn.core.errors import ConfigError
+from lerobot_msdyn.evaluate import __main__ as evaluate
 
 SEQUENCES = ("apple", "block", "paper-windmill", "spin", "teddy")
 SCORES = ("mpsnr", "mssim", "mlpips")

@@ -43,13 +43,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from lerobot.datasets import LeRobotDataset
 
-from lerobot_msdyn import augment, engines
-from lerobot_msdyn.cli import run_command
-from lerobot_msdyn.episode import read_episode
-from lerobot_msdyn.provenance import Provenance, camera_pose
+from lerobot_msdyn.augment import __main__ as augment
+from lerobot_msdyn.augment import run as engines
+from lerobot_msdyn.core.cli import run_command
+from lerobot_msdyn.dataset.provenance import Provenance, camera_pose
+from lerobot_msdyn.dataset.read import read_episode
+from lerobot_msdyn.dataset.write import NewEpisode
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.dataset import write_dataset
-from lerobot_msdyn.write import NewEpisode
 
 GRACE_S = 30  # after the limit, a process that ignores it is killed
 BATCH = 40

@@ -30,12 +30,12 @@ import numpy as np
 import torch
 from corruptions import CORRUPTIONS, clean_priors, corrupted, read_clip
 
-from lerobot_msdyn.cameras import CameraTrack
-from lerobot_msdyn.config import Recipe
-from lerobot_msdyn.pipeline import reconstruct
-from lerobot_msdyn.quality.verdict import judge
-from lerobot_msdyn.quality.witness import decibels
-from lerobot_msdyn.views import Reconstruction, new_pictures
+from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.config import Recipe
+from lerobot_msdyn.reconstruct.reconstruct import reconstruct
+from lerobot_msdyn.reconstruct.self_check import decibels
+from lerobot_msdyn.views.gate import judge
+from lerobot_msdyn.views.pictures import Reconstruction, new_pictures
 
 BAD_DB = 20.0
 WORST_SHARE = 0.2

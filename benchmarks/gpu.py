@@ -31,19 +31,20 @@ from unittest import mock
 import torch
 from rasterizer import Workload, make_workload
 
-from lerobot_msdyn import augment, pipeline
-from lerobot_msdyn.bounds import new_cameras
-from lerobot_msdyn.cli import parse_config
-from lerobot_msdyn.config import AugmentConfig
-from lerobot_msdyn.devices import chosen_device
-from lerobot_msdyn.episode import View, open_source, read_episode
-from lerobot_msdyn.fitting import FitResult, fit
-from lerobot_msdyn.pipeline import reconstruct
-from lerobot_msdyn.quality.witness import decibels
-from lerobot_msdyn.rendering import render_frames
+from lerobot_msdyn.augment import __main__ as augment
+from lerobot_msdyn.core.cli import parse_config
+from lerobot_msdyn.core.config import AugmentConfig
+from lerobot_msdyn.dataset.read import View, open_source, read_episode
+from lerobot_msdyn.reconstruct import reconstruct as pipeline
+from lerobot_msdyn.reconstruct.fit import FitResult, fit
+from lerobot_msdyn.reconstruct.reconstruct import reconstruct
+from lerobot_msdyn.reconstruct.self_check import decibels
+from lerobot_msdyn.render.devices import chosen_device
+from lerobot_msdyn.scene.draw import render_frames
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.dataset import write_dataset
-from lerobot_msdyn.views import new_pictures, on_device
+from lerobot_msdyn.views.new_cameras import new_cameras
+from lerobot_msdyn.views.pictures import new_pictures, on_device
 
 KEY = "observation.images.front"
 ALL_KEPT = {  # views are judged, but none is drawn again or dropped

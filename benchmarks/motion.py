@@ -27,15 +27,15 @@ import torch
 from simulated import OBJECT, ROBOT, Simulated, dense_tracks, instance_of, observed, read_simulated
 from torch import Tensor
 
-from lerobot_msdyn.config import MotionConfig
-from lerobot_msdyn.geometry import axis_angle_to_matrix, se3
-from lerobot_msdyn.motion import bases
-from lerobot_msdyn.motion.bases import COARSEST, MotionLevel, level_from_motions, with_idle
-from lerobot_msdyn.motion.binding import bind
-from lerobot_msdyn.motion.compose import compose
-from lerobot_msdyn.motion.follow import SceneMotion
-from lerobot_msdyn.motion.initialise import motion_from_tracks, scene_motion
-from lerobot_msdyn.motion.lift import LiftedTracks
+from lerobot_msdyn.core.config import MotionConfig
+from lerobot_msdyn.core.geometry import axis_angle_to_matrix, se3
+from lerobot_msdyn.motion.estimate import motion_from_tracks, scene_motion
+from lerobot_msdyn.motion.from_tracks.lift import LiftedTracks
+from lerobot_msdyn.motion.model import bases
+from lerobot_msdyn.motion.model.bases import COARSEST, MotionLevel, level_from_motions, with_idle
+from lerobot_msdyn.motion.model.binding import bind
+from lerobot_msdyn.motion.model.compose import compose
+from lerobot_msdyn.motion.model.scene_motion import SceneMotion
 from lerobot_msdyn.synthetic.bodies import BODY_KINDS, TrackedBody, tracked_body
 
 HIERARCHY = ("object", "primitive", "grain")

@@ -76,15 +76,16 @@ def timed(function: Callable, name: str, seconds: dict[str, float]) -> Callable:
 
 def measure(case: Case, recipe_name: str, steps: int | None, pipe: Connection) -> None:
     """Send the seconds and processor seconds of every stage, and the peak of resident memory (MB)."""
-    from lerobot_msdyn import pipeline, views
-    from lerobot_msdyn.bounds import new_cameras
-    from lerobot_msdyn.cli import parse_config
-    from lerobot_msdyn.config import AugmentConfig
-    from lerobot_msdyn.episode import open_source
+    from lerobot_msdyn.core.cli import parse_config
+    from lerobot_msdyn.core.config import AugmentConfig
+    from lerobot_msdyn.dataset.read import open_source
+    from lerobot_msdyn.reconstruct import reconstruct as pipeline
+    from lerobot_msdyn.reconstruct.share_background import shared_backgrounds
     from lerobot_msdyn.render.warmup import warm_up
-    from lerobot_msdyn.sharing import shared_backgrounds
     from lerobot_msdyn.synthetic import make_scene
     from lerobot_msdyn.synthetic.dataset import write_dataset
+    from lerobot_msdyn.views.new_cameras import new_cameras
+    from lerobot_msdyn.views.pictures import pictures as views
 
     seconds: dict[str, float] = defaultdict(float)
 

@@ -41,14 +41,14 @@ import numpy as np
 import torch
 from numpy import ndarray
 
-from lerobot_msdyn.config import CameraConfig, PriorsConfig, Recipe
-from lerobot_msdyn.episode import View, open_source, read_episode, select_cameras
-from lerobot_msdyn.geometry import quaternion_to_matrix
-from lerobot_msdyn.pipeline import shrink
+from lerobot_msdyn.core.config import CameraConfig, PriorsConfig, Recipe
+from lerobot_msdyn.core.geometry import quaternion_to_matrix
+from lerobot_msdyn.dataset.read import View, open_source, read_episode, select_cameras
 from lerobot_msdyn.priors import PointTracks, estimate_priors
-from lerobot_msdyn.priors.depth import table_plane_depth
-from lerobot_msdyn.priors.masks import moving_instances, temporal_median
-from lerobot_msdyn.priors.tracks import flow_tracks
+from lerobot_msdyn.priors.depth.table_plane import table_plane_depth
+from lerobot_msdyn.priors.masks.moving import moving_instances, temporal_median
+from lerobot_msdyn.priors.tracks.flow import flow_tracks
+from lerobot_msdyn.reconstruct.reconstruct import shrink
 from lerobot_msdyn.synthetic import make_scene
 
 AGES = (30, 60, 90)  # frames

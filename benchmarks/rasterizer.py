@@ -26,9 +26,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from lerobot_msdyn.geometry import quaternion_to_matrix, transform_points
+from lerobot_msdyn.core.geometry import quaternion_to_matrix, transform_points
 from lerobot_msdyn.render import Raster, rasterize
-from lerobot_msdyn.render import cpu as cpu_backend
+from lerobot_msdyn.render.cpu import rasterizer as cpu_backend
 from lerobot_msdyn.render.types import COVARIANCE_BLUR, MIN_ALPHA
 
 WORKLOADS = {"W1": (20_000, 320, 240), "W2": (60_000, 640, 480), "W3": (5_000, 160, 120)}  # Gaussians, px, px

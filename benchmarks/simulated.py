@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lerobot_msdyn.cameras import CameraTrack
-from lerobot_msdyn.geometry import (
+from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.geometry import (
     invert_se3,
     project,
     quaternion_to_matrix,
@@ -22,7 +22,7 @@ from lerobot_msdyn.geometry import (
     transform_points,
     unproject,
 )
-from lerobot_msdyn.priors.types import PointTracks
+from lerobot_msdyn.core.observations import PointTracks
 
 ROBOT, OBJECT = 1, 2  # instances
 _LINKS = range(2, 8)  # body ids of the robot's moving links

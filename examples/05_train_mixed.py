@@ -14,7 +14,7 @@ from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
-from lerobot_msdyn import augment
+from lerobot_msdyn.augment import __main__ as augment
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.dataset import write_dataset
 from lerobot_msdyn.training import MixedViews

@@ -6,8 +6,9 @@ python examples/07_export_scene.py [--frames 60] [--steps 500]
 import argparse
 from pathlib import Path
 
-from lerobot_msdyn import augment, saved
-from lerobot_msdyn.ply import export_frames, load_ply
+from lerobot_msdyn.augment import __main__ as augment
+from lerobot_msdyn.scene import store as saved
+from lerobot_msdyn.scene.ply import export_frames, load_ply
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.dataset import write_dataset
 

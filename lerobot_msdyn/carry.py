@@ -8,9 +8,9 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lerobot_msdyn.cli import EXIT_OK, parse_config, run_command
-from lerobot_msdyn.config import CarryConfig
-from lerobot_msdyn.errors import ConfigError, DatasetError
+from lerobot_msdyn.core.cli import EXIT_OK, parse_config, run_command
+from lerobot_msdyn.core.config import CarryConfig
+from lerobot_msdyn.core.errors import ConfigError, DatasetError
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDatasetMetadata
@@ -31,9 +31,9 @@ def carry_provenance(root: Path, sources: list[Path]) -> int:
     Raises:
         DatasetError: an episode is in none of the sources, or in several that say different things about it.
     """
-    from lerobot_msdyn.card import write_card
-    from lerobot_msdyn.episode import open_source
-    from lerobot_msdyn.provenance import write_rows
+    from lerobot_msdyn.dataset.card import write_card
+    from lerobot_msdyn.dataset.provenance import write_rows
+    from lerobot_msdyn.dataset.read import open_source
 
     known: dict[Mark, list[dict[str, Any]]] = {}
     origin: dict[str | None, dict[str, Any]] = {}
@@ -59,9 +59,9 @@ def carry_provenance(root: Path, sources: list[Path]) -> int:
 
 def _known_episodes(root: Path) -> list[tuple[Mark, dict[str, Any]]]:
     """By what an episode is recognised, and what is known about it."""
-    from lerobot_msdyn.episode import open_source
-    from lerobot_msdyn.lineage import provenance_of
-    from lerobot_msdyn.provenance import SOURCE_VARIANT
+    from lerobot_msdyn.dataset.lineage import provenance_of
+    from lerobot_msdyn.dataset.provenance import SOURCE_VARIANT
+    from lerobot_msdyn.dataset.read import open_source
 
     meta = open_source(root.name, root)
     rows = provenance_of(meta) or [
@@ -72,7 +72,7 @@ def _known_episodes(root: Path) -> list[tuple[Mark, dict[str, Any]]]:
 
 
 def _marks(meta: "LeRobotDatasetMetadata") -> list[Mark]:
-    from lerobot_msdyn.lineage import picture_digests, row_digests
+    from lerobot_msdyn.dataset.lineage import picture_digests, row_digests
 
     return list(zip(row_digests(meta), picture_digests(meta), strict=True))
 

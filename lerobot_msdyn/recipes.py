@@ -6,8 +6,8 @@ python -m lerobot_msdyn.recipes ls | show NAME | check FILE
 import sys
 from pathlib import Path
 
-from lerobot_msdyn.cli import EXIT_OK, load_recipe, recipe_folder, recipe_path, run_command
-from lerobot_msdyn.errors import ConfigError
+from lerobot_msdyn.core.cli import EXIT_OK, load_recipe, recipe_folder, recipe_path, run_command
+from lerobot_msdyn.core.errors import ConfigError
 
 USAGE = """usage: python -m lerobot_msdyn.recipes ls           name and purpose of every recipe
        python -m lerobot_msdyn.recipes show NAME    one recipe, to copy and change

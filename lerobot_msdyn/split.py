@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lerobot_msdyn.cli import EXIT_OK, parse_config, run_command
-from lerobot_msdyn.config import SplitConfig
-from lerobot_msdyn.errors import ConfigError, DatasetError
+from lerobot_msdyn.core.cli import EXIT_OK, parse_config, run_command
+from lerobot_msdyn.core.config import SplitConfig
+from lerobot_msdyn.core.errors import ConfigError, DatasetError
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDatasetMetadata
@@ -56,9 +56,9 @@ def split_by_source(root: Path, share: float = 0.2) -> Split:
         DatasetError: no task has two recordings.
         ConfigError: the share is not between 0 and 1.
     """
-    from lerobot_msdyn.episode import open_source
-    from lerobot_msdyn.lineage import provenance_of, recordings
-    from lerobot_msdyn.provenance import SOURCE_VARIANT
+    from lerobot_msdyn.dataset.lineage import provenance_of, recordings
+    from lerobot_msdyn.dataset.provenance import SOURCE_VARIANT
+    from lerobot_msdyn.dataset.read import open_source
 
     if not 0 < share < 1:
         raise ConfigError(f"eval_split is {share}; expected a share between 0 and 1")

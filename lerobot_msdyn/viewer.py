@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lerobot_msdyn.cli import EXIT_OK, parse_config, run_command
-from lerobot_msdyn.config import ViewerConfig
-from lerobot_msdyn.errors import ConfigError, DatasetError, MsdynError, OutputError
+from lerobot_msdyn.core.cli import EXIT_OK, parse_config, run_command
+from lerobot_msdyn.core.config import ViewerConfig
+from lerobot_msdyn.core.errors import ConfigError, DatasetError, MsdynError, OutputError
 
 if TYPE_CHECKING:
     import rerun as rr
 
-    from lerobot_msdyn.cameras import CameraTrack
-    from lerobot_msdyn.episode import View
+    from lerobot_msdyn.core.cameras import CameraTrack
+    from lerobot_msdyn.dataset.read import View
     from lerobot_msdyn.priors import Priors
-    from lerobot_msdyn.saved import SavedScene
+    from lerobot_msdyn.scene.store import SavedScene
 
 logger = logging.getLogger(__name__)
 
@@ -61,9 +61,9 @@ def show_episode(config: ViewerConfig, stream: "rr.RecordingStream") -> None:
     Raises:
         DatasetError: there is no such dataset or episode, or the scenes hold none of it.
     """
-    from lerobot_msdyn import saved
-    from lerobot_msdyn.episode import open_source, read_episode, select_cameras, select_episodes, shrink
+    from lerobot_msdyn.dataset.read import open_source, read_episode, select_cameras, select_episodes, shrink
     from lerobot_msdyn.priors import estimate_priors
+    from lerobot_msdyn.scene import store as saved
 
     source = open_source(config.repo_id, config.root)
     (index,) = select_episodes(source, [config.episode])
@@ -92,8 +92,8 @@ def show_episode(config: ViewerConfig, stream: "rr.RecordingStream") -> None:
 
 def _reconstructed(config: ViewerConfig, source: Any, index: int, key: str, views: dict[str, "View"]) -> "SavedScene":
     """The scene of a camera, fitted now."""
-    from lerobot_msdyn.pipeline import reconstruct, to_saved
-    from lerobot_msdyn.saved import SceneSource
+    from lerobot_msdyn.reconstruct.reconstruct import reconstruct, to_saved
+    from lerobot_msdyn.scene.store import SceneSource
 
     others = [other for name, other in views.items() if name != key]
     logger.info("fitting %s; saved scenes are shown at once (--scenes)", key)
@@ -137,7 +137,7 @@ def _log_gaussians(log: _Log, scene: "SavedScene") -> None:
     """The static set once per window; the moving one at every frame, in its own colours and in those of its levels."""
     import rerun as rr
 
-    from lerobot_msdyn.ply import gaussians_at
+    from lerobot_msdyn.scene.ply import gaussians_at
 
     for start, window in zip(scene.starts, scene.windows, strict=True):
         static, still = window.static, len(window.static)
@@ -196,8 +196,8 @@ def _log_new_view(log: _Log, config: ViewerConfig, scene: "SavedScene", variant:
     import rerun as rr
     import torch
 
-    from lerobot_msdyn.perturbation import Viewpoint, amounts_of, draw, moved
     from lerobot_msdyn.training.live import LiveScene
+    from lerobot_msdyn.views.perturbation import Viewpoint, amounts_of, draw, moved
 
     key, view = scene.source.camera, Viewpoint(scene.camera, scene.distance, scene.metric)
     share = draw(config.perturbation, config.seed, scene.source.episode, variant, len(scene))

@@ -17,14 +17,14 @@ from lerobot.scripts.lerobot_edit_dataset import (
     edit_dataset,
 )
 
-from lerobot_msdyn.card import card_arguments
 from lerobot_msdyn.carry import carry_provenance
-from lerobot_msdyn.episode import open_source, read_colour, read_rows
-from lerobot_msdyn.errors import DatasetError
-from lerobot_msdyn.lineage import recordings
-from lerobot_msdyn.provenance import SOURCE_VARIANT, Provenance, read_provenance
+from lerobot_msdyn.core.errors import DatasetError
+from lerobot_msdyn.dataset.card import card_arguments
+from lerobot_msdyn.dataset.lineage import recordings
+from lerobot_msdyn.dataset.provenance import SOURCE_VARIANT, Provenance, read_provenance
+from lerobot_msdyn.dataset.read import open_source, read_colour, read_rows
+from lerobot_msdyn.dataset.write import NewEpisode, OutputDataset
 from lerobot_msdyn.split import split_by_source
-from lerobot_msdyn.write import NewEpisode, OutputDataset
 
 FRONT = "observation.images.front"
 

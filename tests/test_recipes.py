@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_msdyn.errors import ConfigError
+from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.recipes import known_recipes, run
 
 PROJECT = Path(__file__).parent.parent

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_msdyn.errors import ConfigError, OutputError
-from lerobot_msdyn.geometry import invert_se3, project, transform_points, unproject_image
+from lerobot_msdyn.core.errors import ConfigError, OutputError
+from lerobot_msdyn.core.geometry import invert_se3, project, transform_points, unproject_image
 from lerobot_msdyn.synthetic import (
     SyntheticScene,
     SyntheticView,

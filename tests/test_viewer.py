@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_msdyn import viewer
-from lerobot_msdyn.errors import ConfigError, DatasetError, OutputError
+from lerobot_msdyn.core.errors import ConfigError, DatasetError, OutputError
 
 pytest.importorskip("rerun")
 

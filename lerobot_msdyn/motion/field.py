@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lerobot_msdyn.geometry import quaternion_multiply
+from lerobot_msdyn.core.geometry import quaternion_multiply
 
 _POINT_OCTAVES = 6  # frequencies that encode a position ...
 _TIME_OCTAVES = 6  # ... and a time (Deformable 3D Gaussians, section 3.2)

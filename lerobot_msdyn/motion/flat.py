@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lerobot_msdyn.motion.bases import COARSEST, MotionLevel
-from lerobot_msdyn.motion.binding import bind
-from lerobot_msdyn.motion.clusters import direction_features, filled, k_means
-from lerobot_msdyn.motion.residual import ResidualTracks, cluster_places, smoothed_level, solve_residual
+from lerobot_msdyn.motion.finer.residual import ResidualTracks, cluster_places, smoothed_level, solve_residual
+from lerobot_msdyn.motion.from_tracks.clusters import direction_features, filled, k_means
+from lerobot_msdyn.motion.model.bases import COARSEST, MotionLevel
+from lerobot_msdyn.motion.model.binding import bind
 
 _SMOOTHING = 1.0  # of the bases over time: they carry the whole motion, contacts included
 _LEAST_TRACKS = 12  # of a basis

@@ -7,8 +7,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from lerobot_msdyn.core.observations import Origin, PointTracks, Priors
     from lerobot_msdyn.priors.estimate import estimate_masks, estimate_priors
-    from lerobot_msdyn.priors.types import Origin, PointTracks, Priors
 
 __all__ = ["Origin", "PointTracks", "Priors", "estimate_masks", "estimate_priors"]
 
@@ -16,5 +16,5 @@ __all__ = ["Origin", "PointTracks", "Priors", "estimate_masks", "estimate_priors
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    home = "estimate" if name.startswith("estimate") else "types"
-    return getattr(importlib.import_module(f"{__name__}.{home}"), name)
+    home = "priors.estimate" if name.startswith("estimate") else "core.observations"
+    return getattr(importlib.import_module(f"lerobot_msdyn.{home}"), name)

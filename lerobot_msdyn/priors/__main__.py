@@ -9,12 +9,12 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lerobot_msdyn.cli import EXIT_OK, EXIT_SOME_EPISODES_FAILED, parse_config, run_command
-from lerobot_msdyn.config import PriorsCommandConfig
-from lerobot_msdyn.errors import ConfigError, EpisodeError, OutputError
+from lerobot_msdyn.core.cli import EXIT_OK, EXIT_SOME_EPISODES_FAILED, parse_config, run_command
+from lerobot_msdyn.core.config import PriorsCommandConfig
+from lerobot_msdyn.core.errors import ConfigError, EpisodeError, OutputError
 
 if TYPE_CHECKING:
-    from lerobot_msdyn.episode import Episode
+    from lerobot_msdyn.dataset.read import Episode
 
 logger = logging.getLogger(__name__)
 
@@ -28,7 +28,7 @@ def run(arguments: list[str]) -> int:
     for name, given in (("repo", config.repo_id != ""), ("out", config.out != Path())):
         if not given:
             raise ConfigError(f"--{name} is missing; expected: {COMMAND} --repo NAME [--root FOLDER] --out DIR")
-    from lerobot_msdyn.episode import open_source, read_episode, select_cameras, select_episodes
+    from lerobot_msdyn.dataset.read import open_source, read_episode, select_cameras, select_episodes
 
     source = open_source(config.repo_id, config.root)
     cameras = select_cameras(source, config.cameras)
@@ -56,7 +56,7 @@ def one_episode(episode: "Episode", config: PriorsCommandConfig) -> None:
     """
     import cv2
 
-    from lerobot_msdyn.episode import shrink
+    from lerobot_msdyn.dataset.read import shrink
     from lerobot_msdyn.priors import estimate_priors
     from lerobot_msdyn.priors.exchange import from_priors, write_exchange
     from lerobot_msdyn.priors.sheet import contact_sheet

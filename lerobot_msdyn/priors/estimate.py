@@ -6,16 +6,16 @@ from collections.abc import Sequence
 from jaxtyping import UInt8
 from torch import Tensor
 
-from lerobot_msdyn.config import CameraConfig, PriorsConfig
-from lerobot_msdyn.episode import View
+from lerobot_msdyn.core.config import CameraConfig, PriorsConfig
+from lerobot_msdyn.core.observations import Priors
+from lerobot_msdyn.dataset.read import View
 from lerobot_msdyn.priors.cache import open_cache
+from lerobot_msdyn.priors.camera.provide import provide_camera, with_searched_fov
+from lerobot_msdyn.priors.depth.provide import provide_depth
 from lerobot_msdyn.priors.hub import torch_device
-from lerobot_msdyn.priors.provide_cameras import provide_camera, with_searched_fov
-from lerobot_msdyn.priors.provide_depth import provide_depth
-from lerobot_msdyn.priors.provide_masks import provide_masks
-from lerobot_msdyn.priors.provide_tracks import provide_tracks
+from lerobot_msdyn.priors.masks.provide import provide_masks
 from lerobot_msdyn.priors.request import Request
-from lerobot_msdyn.priors.types import Priors
+from lerobot_msdyn.priors.tracks.provide import provide_tracks
 
 logger = logging.getLogger(__name__)
 

@@ -15,10 +15,10 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, Shaped, UInt8
 from numpy import ndarray
 
-from lerobot_msdyn.episode import View
-from lerobot_msdyn.errors import PriorError
+from lerobot_msdyn.core.errors import PriorError
+from lerobot_msdyn.core.observations import Priors
+from lerobot_msdyn.dataset.read import View
 from lerobot_msdyn.priors.cache import save_npz
-from lerobot_msdyn.priors.types import Priors
 
 DEPTH_KINDS = ("metric", "scale", "affine_disparity")
 MAX_INSTANCE = 255

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from huggingface_hub import constants, try_to_load_from_cache
 
-from lerobot_msdyn.errors import PriorError
+from lerobot_msdyn.core.errors import PriorError
 
 UNKNOWN_LICENCE = "unknown: read its model card"
 NON_COMMERCIAL = "CC-BY-NC-4.0"

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from jaxtyping import UInt8
 from torch import Tensor
 
-from lerobot_msdyn.config import CameraConfig, PriorsConfig
-from lerobot_msdyn.episode import View
-from lerobot_msdyn.errors import PriorError
+from lerobot_msdyn.core.config import CameraConfig, PriorsConfig
+from lerobot_msdyn.core.errors import PriorError
+from lerobot_msdyn.core.observations import Origin
+from lerobot_msdyn.dataset.read import View
 from lerobot_msdyn.priors.cache import PriorCache
 from lerobot_msdyn.priors.exchange import Exchange, exchange_path, read_exchange
-from lerobot_msdyn.priors.types import Origin
 
 logger = logging.getLogger(__name__)
 

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float32, Int, UInt8
 from numpy import ndarray
 
-from lerobot_msdyn.episode import View
-from lerobot_msdyn.priors.types import PointTracks, Priors
+from lerobot_msdyn.core.observations import PointTracks, Priors
+from lerobot_msdyn.dataset.read import View
 
 _CELL_WIDTH = 320  # px
 _GAP, _LINE = 4, 22  # px: between pictures, and of a line of text

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lerobot_msdyn.errors import RenderError
+from lerobot_msdyn.core.errors import RenderError
 from lerobot_msdyn.render.availability import cuda_problem
 from lerobot_msdyn.render.reference import rasterize_reference
 from lerobot_msdyn.render.types import MAX_CPU_CHANNELS, Raster
@@ -94,7 +94,7 @@ def _load(backend: str) -> tuple[Callable[..., Raster] | None, str]:
         return rasterize_reference, ""
     try:
         if backend == "cpu":
-            from lerobot_msdyn.render.cpu import rasterize_cpu
+            from lerobot_msdyn.render.cpu.rasterizer import rasterize_cpu
 
             return rasterize_cpu, ""
         problem = cuda_problem()

@@ -5,8 +5,8 @@ from gsplat import rasterization
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lerobot_msdyn.errors import RenderError
-from lerobot_msdyn.geometry import transform_points
+from lerobot_msdyn.core.errors import RenderError
+from lerobot_msdyn.core.geometry import transform_points
 from lerobot_msdyn.render.reference import drawable, rasterize_reference
 from lerobot_msdyn.render.types import COVARIANCE_BLUR, QUAT_LENGTHS, Raster
 from lerobot_msdyn.render.validation import check_values

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lerobot_msdyn.geometry import quaternion_to_matrix
+from lerobot_msdyn.core.geometry import quaternion_to_matrix
 from lerobot_msdyn.render.types import (
     COVARIANCE_BLUR,
     FURTHEST,

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from lerobot_msdyn.errors import RenderError
+from lerobot_msdyn.core.errors import RenderError
 from lerobot_msdyn.render.types import QUAT_LENGTHS
 
 # tensor -> its shape after the optional leading view dimension; "g" is shared, "c" is free

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 
 import torch
 
-from lerobot_msdyn.errors import MsdynError
+from lerobot_msdyn.core.errors import MsdynError
 from lerobot_msdyn.render.backends import rasterize
 from lerobot_msdyn.render.types import MAX_CPU_CHANNELS
 

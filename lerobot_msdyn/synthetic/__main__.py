@@ -5,7 +5,7 @@ import logging
 import sys
 from pathlib import Path
 
-from lerobot_msdyn.errors import MsdynError
+from lerobot_msdyn.core.errors import MsdynError
 from lerobot_msdyn.synthetic.choreography import KINDS
 from lerobot_msdyn.synthetic.dataset import write_dataset
 from lerobot_msdyn.synthetic.iphone import write_iphone_folder

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lerobot_msdyn.geometry import axis_angle_to_matrix
+from lerobot_msdyn.core.geometry import axis_angle_to_matrix
 
 BodyKind = Literal["rigid", "weak", "deformable"]
 BODY_KINDS: tuple[BodyKind, ...] = get_args(BodyKind)

@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from lerobot_msdyn.errors import ConfigError
+from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.synthetic.rigid import from_axes, pose
 
 KINDS = ("push", "lid", "sheet", "static", "all")

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_msdyn.errors import ConfigError, OutputError
+from lerobot_msdyn.core.errors import ConfigError, OutputError
 from lerobot_msdyn.synthetic.choreography import STATE_NAMES
 from lerobot_msdyn.synthetic.scene import SyntheticScene, SyntheticView
 
@@ -83,7 +83,7 @@ def record(
     from lerobot.configs import DepthEncoderConfig
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from lerobot_msdyn.video import quiet_encoders
+    from lerobot_msdyn.dataset.video import quiet_encoders
 
     quiet_encoders()
     if root.exists():

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 import torch
 
-from lerobot_msdyn.cameras import CameraTrack
-from lerobot_msdyn.errors import ConfigError, OutputError
-from lerobot_msdyn.geometry import matrix_to_quaternion
+from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.errors import ConfigError, OutputError
+from lerobot_msdyn.core.geometry import matrix_to_quaternion
 from lerobot_msdyn.synthetic.nvs import covisibility
 from lerobot_msdyn.synthetic.scene import SyntheticScene, SyntheticView
 from lerobot_msdyn.synthetic.viewpoints import hand_held_camera, heldout_cameras

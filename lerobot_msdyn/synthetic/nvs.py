@@ -27,9 +27,9 @@ import cv2
 import numpy as np
 import torch
 
-from lerobot_msdyn.cameras import CameraTrack
-from lerobot_msdyn.errors import ConfigError, OutputError
-from lerobot_msdyn.geometry import matrix_to_quaternion
+from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.errors import ConfigError, OutputError
+from lerobot_msdyn.core.geometry import matrix_to_quaternion
 from lerobot_msdyn.synthetic import dataset
 from lerobot_msdyn.synthetic.raycast import mark_covisible
 from lerobot_msdyn.synthetic.scene import SyntheticScene, SyntheticView, pinhole

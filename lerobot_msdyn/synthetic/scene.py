@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from lerobot_msdyn.cameras import CameraTrack
-from lerobot_msdyn.errors import ConfigError
-from lerobot_msdyn.geometry import project, transform_points
+from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.errors import ConfigError
+from lerobot_msdyn.core.geometry import project, transform_points
 from lerobot_msdyn.synthetic import desk
 from lerobot_msdyn.synthetic.choreography import Choreography, choreograph
 from lerobot_msdyn.synthetic.desk import Primitive

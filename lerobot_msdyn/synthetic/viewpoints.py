@@ -5,7 +5,7 @@ import math
 import numpy as np
 import torch
 
-from lerobot_msdyn.cameras import CameraTrack, intrinsics_from_fov, static_camera
+from lerobot_msdyn.core.cameras import CameraTrack, intrinsics_from_fov, static_camera
 from lerobot_msdyn.synthetic.rigid import look_at
 
 TARGET = np.array([0.0, 0.03, 0.04])  # m, what the front camera looks at and the held-out ones orbit about

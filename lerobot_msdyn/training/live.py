@@ -8,14 +8,14 @@ import torch
 from jaxtyping import Bool, Float32, Int, UInt8
 from torch import Tensor
 
-from lerobot_msdyn.cameras import CameraTrack
-from lerobot_msdyn.coverage import HOLE_ALPHA
-from lerobot_msdyn.motion.bases import MotionLevel, level_affines
-from lerobot_msdyn.overlay import Overlay
+from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.motion.model.bases import MotionLevel, level_affines
 from lerobot_msdyn.render import rasterize
-from lerobot_msdyn.saved import SavedScene
-from lerobot_msdyn.scene import PATCH_OPACITY, DynamicScene
+from lerobot_msdyn.scene.gaussians import PATCH_OPACITY, DynamicScene
+from lerobot_msdyn.scene.overlay import Overlay
+from lerobot_msdyn.scene.store import SavedScene
 from lerobot_msdyn.training.posing import pose
+from lerobot_msdyn.views.coverage import HOLE_ALPHA
 
 _COARSER = 4  # holes are filled at a quarter of the size
 _SMALLEST_PX = 2  # the pyramid that fills holes ends where a side is so short

@@ -7,11 +7,12 @@ from pathlib import Path
 import pyarrow.parquet as pq
 from lerobot.datasets import LeRobotDatasetMetadata
 
-from lerobot_msdyn import provenance, saved
-from lerobot_msdyn.cli import parse_config
-from lerobot_msdyn.config import AugmentConfig, Recipe
-from lerobot_msdyn.errors import DatasetError
-from lerobot_msdyn.saved import SavedScene
+from lerobot_msdyn.core.cli import parse_config
+from lerobot_msdyn.core.config import AugmentConfig, Recipe
+from lerobot_msdyn.core.errors import DatasetError
+from lerobot_msdyn.dataset import provenance
+from lerobot_msdyn.scene import store as saved
+from lerobot_msdyn.scene.store import SavedScene
 from lerobot_msdyn.training.scene_cache import Scenes
 
 logger = logging.getLogger(__name__)
@@ -88,7 +89,7 @@ def _check_name(meta: LeRobotDatasetMetadata, scenes: Path, known: Mapping[int, 
     if made_of != meta.repo_id:
         raise DatasetError(
             f"{scenes}: the scenes are of {made_of}; expected {meta.repo_id}, the dataset that is wrapped; if they are "
-            "the same, open it by that name, or pass the scenes as a mapping (lerobot_msdyn.saved.list_scenes)"
+            "the same, open it by that name, or pass the scenes as a mapping (lerobot_msdyn.scene.store.list_scenes)"
         )
 
 

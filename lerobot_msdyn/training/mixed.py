@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from lerobot.datasets import LeRobotDataset
 
-from lerobot_msdyn.config import MixedViewsConfig, PerturbationConfig
+from lerobot_msdyn.core.config import MixedViewsConfig, PerturbationConfig
 from lerobot_msdyn.training.mixer import ViewMixer, colour_sample, depth_sample
 from lerobot_msdyn.training.scene_cache import Scenes
 

@@ -11,16 +11,16 @@ from lerobot.configs import DepthEncoderConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from torch import Tensor
 
-from lerobot_msdyn.cameras import CameraTrack
-from lerobot_msdyn.config import MixedViewsConfig, OtherCameraConfig, PerturbationConfig, problems
-from lerobot_msdyn.coverage import HOLE_ALPHA
-from lerobot_msdyn.episode import MILLIMETRES, depth_key_of
-from lerobot_msdyn.errors import ConfigError
-from lerobot_msdyn.perturbation import Viewpoint, amounts_of, draw, moved
-from lerobot_msdyn.saved import SavedScene
+from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.config import MixedViewsConfig, OtherCameraConfig, PerturbationConfig, problems
+from lerobot_msdyn.core.errors import ConfigError
+from lerobot_msdyn.dataset.read import MILLIMETRES, depth_key_of
+from lerobot_msdyn.scene.store import SavedScene
 from lerobot_msdyn.training.live import LiveScene
 from lerobot_msdyn.training.matching import recipe_of, scenes_of
 from lerobot_msdyn.training.scene_cache import SceneCache, Scenes
+from lerobot_msdyn.views.coverage import HOLE_ALPHA
+from lerobot_msdyn.views.perturbation import Viewpoint, amounts_of, draw, moved
 
 FACTORS = (1.0, 0.5, 0.25)  # of a change that was drawn, until little enough of the picture is empty
 

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float32, Int32, Int64
 from numpy import ndarray
 
-from lerobot_msdyn.render.jit import device, kernel
-from lerobot_msdyn.render.vectors3 import add, apply_transposed, combined, cross, dot, scaled
-from lerobot_msdyn.scene import SH_C0, SH_C1
+from lerobot_msdyn.render.cpu.jit import device, kernel
+from lerobot_msdyn.render.cpu.vectors3 import add, apply_transposed, combined, cross, dot, scaled
+from lerobot_msdyn.scene.gaussians import SH_C0, SH_C1
 
 _DEGENERATE = np.float32(1e-6)  # square of the area below which a blend has no direction left (as in motion.bases)
 _C0, _C1 = np.float32(SH_C0), np.float32(SH_C1)

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from lerobot_msdyn.saved import SavedScene, load
+from lerobot_msdyn.scene.store import SavedScene, load
 from lerobot_msdyn.training.live import LiveScene
 
 MEGABYTE = 1024**2

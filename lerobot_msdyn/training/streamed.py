@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from lerobot_msdyn.config import MixedViewsConfig, PerturbationConfig
+from lerobot_msdyn.core.config import MixedViewsConfig, PerturbationConfig
 from lerobot_msdyn.training.mixer import ViewMixer, colour_sample, depth_sample
 from lerobot_msdyn.training.scene_cache import Scenes
 

@@ -5,12 +5,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from lerobot_msdyn import augment, pipeline
-from lerobot_msdyn.config import Device, Recipe
-from lerobot_msdyn.episode import View
+from lerobot_msdyn.augment import __main__ as augment
+from lerobot_msdyn.core.config import Device, Recipe
+from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.reconstruct import reconstruct as pipeline
 from lerobot_msdyn.render.availability import cuda_problem
 from lerobot_msdyn.synthetic import make_scene
-from lerobot_msdyn.views import new_pictures, on_device
+from lerobot_msdyn.views.pictures import new_pictures, on_device
 
 pytestmark = [pytest.mark.gpu, pytest.mark.slow]
 

@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from lerobot_msdyn.geometry import axis_angle_to_matrix, invert_se3, se3, transform_points
-from lerobot_msdyn.motion.alignment import Sightings, Video, carried_costs, read_video, sight
-from lerobot_msdyn.motion.regroup import Grouping
+from lerobot_msdyn.core.geometry import axis_angle_to_matrix, invert_se3, se3, transform_points
+from lerobot_msdyn.motion.to_video.alignment import Sightings, Video, carried_costs, read_video, sight
+from lerobot_msdyn.motion.to_video.regroup import Grouping
 from lerobot_msdyn.synthetic import SyntheticScene, make_scene
 
 FRAMES = 24

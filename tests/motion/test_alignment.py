@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import torch
 
-from lerobot_msdyn.motion.alignment import Sightings, Video, align
-from lerobot_msdyn.motion.regroup import Grouping
+from lerobot_msdyn.motion.to_video.alignment import Sightings, Video, align
+from lerobot_msdyn.motion.to_video.regroup import Grouping
 
 
 def shifted(truth: Grouping, video: Video) -> Grouping:

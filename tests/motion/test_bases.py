@@ -4,8 +4,8 @@ import math
 
 import torch
 
-from lerobot_msdyn.geometry import axis_angle_to_matrix, se3
-from lerobot_msdyn.motion.bases import identity_level, knot_frames, level_affines, level_from_motions, with_idle
+from lerobot_msdyn.core.geometry import axis_angle_to_matrix, se3
+from lerobot_msdyn.motion.model.bases import identity_level, knot_frames, level_affines, level_from_motions, with_idle
 
 
 def test_identity_level_moves_nothing() -> None:

@@ -2,7 +2,13 @@
 
 import torch
 
-from lerobot_msdyn.motion.clusters import direction_features, displacement_features, filled, k_means, spread_nodes
+from lerobot_msdyn.motion.from_tracks.clusters import (
+    direction_features,
+    displacement_features,
+    filled,
+    k_means,
+    spread_nodes,
+)
 
 
 def test_gaps_are_bridged_inside_and_held_outside() -> None:

@@ -6,9 +6,9 @@ import math
 import torch
 from torch import Tensor
 
-from lerobot_msdyn.geometry import axis_angle_to_matrix, quaternion_to_matrix, se3
-from lerobot_msdyn.motion.bases import MotionLevel, identity_level, level_affines, level_from_motions
-from lerobot_msdyn.motion.compose import compose
+from lerobot_msdyn.core.geometry import axis_angle_to_matrix, quaternion_to_matrix, se3
+from lerobot_msdyn.motion.model.bases import MotionLevel, identity_level, level_affines, level_from_motions
+from lerobot_msdyn.motion.model.compose import compose
 
 
 def turn_about(point: Tensor, axis_angle: Tensor) -> Tensor:

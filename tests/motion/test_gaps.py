@@ -4,9 +4,9 @@ import math
 
 import torch
 
-from lerobot_msdyn.geometry import axis_angle_to_matrix, invert_se3, se3, transform_points
-from lerobot_msdyn.motion.gaps import STILL, fill_gaps, find_carriers
-from lerobot_msdyn.motion.initialise import initialise_objects
+from lerobot_msdyn.core.geometry import axis_angle_to_matrix, invert_se3, se3, transform_points
+from lerobot_msdyn.motion.estimate import initialise_objects
+from lerobot_msdyn.motion.from_tracks.gaps import STILL, fill_gaps, find_carriers
 
 
 def turning() -> tuple[torch.Tensor, torch.Tensor]:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lerobot_msdyn.motion.kernels import OUTLIER, UNSEEN, Maps, frame_costs
+from lerobot_msdyn.motion.to_video.kernels import OUTLIER, UNSEEN, Maps, frame_costs
 
 SIDE = 40
 GREY = 100

@@ -2,8 +2,8 @@
 
 import torch
 
-from lerobot_msdyn.cameras import static_camera
-from lerobot_msdyn.motion.lift import lift_tracks, position_noise
+from lerobot_msdyn.core.cameras import static_camera
+from lerobot_msdyn.motion.from_tracks.lift import lift_tracks, position_noise
 from lerobot_msdyn.priors import PointTracks
 
 K = torch.tensor([[100.0, 0.0, 32.0], [0.0, 100.0, 24.0], [0.0, 0.0, 1.0]])

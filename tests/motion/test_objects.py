@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-from lerobot_msdyn.motion.bases import level_affines
-from lerobot_msdyn.motion.objects import canonical_frame, initialise_objects
+from lerobot_msdyn.motion.from_tracks.objects import canonical_frame, initialise_objects
+from lerobot_msdyn.motion.model.bases import level_affines
 
 
 def moved(level, part: int, points: Tensor) -> Tensor:

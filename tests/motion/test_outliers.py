@@ -2,7 +2,7 @@
 
 import torch
 
-from lerobot_msdyn.motion.outliers import coherence
+from lerobot_msdyn.motion.from_tracks.outliers import coherence
 
 
 def test_what_slips_is_not_trusted_and_what_bends_is() -> None:

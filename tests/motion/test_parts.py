@@ -2,7 +2,7 @@
 
 import torch
 
-from lerobot_msdyn.motion.parts import split_rigid_parts
+from lerobot_msdyn.motion.from_tracks.parts import split_rigid_parts
 
 
 def agreement(part: torch.Tensor, truth: torch.Tensor) -> float:

@@ -5,13 +5,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from lerobot_msdyn.config import MotionConfig
-from lerobot_msdyn.geometry import invert_se3
-from lerobot_msdyn.motion.alignment import Sightings, Video
-from lerobot_msdyn.motion.bases import level_affines, level_from_motions
-from lerobot_msdyn.motion.follow import SceneMotion
-from lerobot_msdyn.motion.register import Recording
-from lerobot_msdyn.motion.regroup import Grouping
+from lerobot_msdyn.core.config import MotionConfig
+from lerobot_msdyn.core.geometry import invert_se3
+from lerobot_msdyn.motion.model.bases import level_affines, level_from_motions
+from lerobot_msdyn.motion.model.scene_motion import SceneMotion
+from lerobot_msdyn.motion.to_video.alignment import Sightings, Video
+from lerobot_msdyn.motion.to_video.register import Recording
+from lerobot_msdyn.motion.to_video.regroup import Grouping
 from lerobot_msdyn.synthetic import SyntheticScene, SyntheticTracks, SyntheticView, make_scene
 
 FRAMES, CANONICAL = 12, 6
@@ -94,7 +94,7 @@ def test_a_worse_motion_is_refused(
         off[::2, 2, 3] = 0.05
         return replace(start, motions=off @ start.motions)
 
-    monkeypatch.setattr("lerobot_msdyn.motion.register.regroup", shifted)
+    monkeypatch.setattr("lerobot_msdyn.motion.to_video.register.regroup", shifted)
     assert recording.register(registered, MotionConfig()) is registered
 
 

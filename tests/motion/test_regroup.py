@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import torch
 
-from lerobot_msdyn.motion.alignment import Sightings, Video
-from lerobot_msdyn.motion.regroup import Grouping, regroup
+from lerobot_msdyn.motion.to_video.alignment import Sightings, Video
+from lerobot_msdyn.motion.to_video.regroup import Grouping, regroup
 
 
 def whole(truth: Grouping, points: Sightings) -> Grouping:

@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-from lerobot_msdyn.geometry import axis_angle_to_matrix
-from lerobot_msdyn.motion.residual import (
+from lerobot_msdyn.core.geometry import axis_angle_to_matrix
+from lerobot_msdyn.motion.finer.residual import (
     ResidualTracks,
     cluster_places,
     pull_back,

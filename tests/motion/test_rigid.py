@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-from lerobot_msdyn.geometry import transform_points
-from lerobot_msdyn.motion.rigid import fit_rigid, model_points, residuals
+from lerobot_msdyn.core.geometry import transform_points
+from lerobot_msdyn.motion.from_tracks.rigid import fit_rigid, model_points, residuals
 
 
 def worst_error(motions: Tensor, truth: Tensor, points: Tensor) -> float:

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from lerobot_msdyn.errors import PriorError
-from lerobot_msdyn.priors.align import align_disparity, align_scale
+from lerobot_msdyn.core.errors import PriorError
+from lerobot_msdyn.priors.depth.align import align_disparity, align_scale
 
 
 def test_disparity_is_aligned_in_spite_of_outliers() -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lerobot_msdyn.priors.change import Colours, Reference, along_edges
+from lerobot_msdyn.priors.masks.change import Colours, Reference, along_edges
 
 NOISE = np.ones((72, 96), np.float32)
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from lerobot_msdyn.cli import run_command
+from lerobot_msdyn.core.cli import run_command
 from lerobot_msdyn.priors.__main__ import run as priors_command
 from lerobot_msdyn.priors.exchange import read_exchange
 

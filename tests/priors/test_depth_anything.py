@@ -9,8 +9,8 @@ pytest.importorskip("transformers")
 
 from tiny_models import save_depth_anything
 
-from lerobot_msdyn.errors import PriorError
-from lerobot_msdyn.priors.depth_anything import predict_depth
+from lerobot_msdyn.core.errors import PriorError
+from lerobot_msdyn.priors.depth.depth_anything import predict_depth
 from lerobot_msdyn.priors.hub import find_model
 
 RGB = torch.randint(0, 255, (5, 48, 64, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))

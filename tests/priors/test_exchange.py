@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lerobot_msdyn.errors import PriorError
+from lerobot_msdyn.core.errors import PriorError
 from lerobot_msdyn.priors.exchange import Exchange, exchange_path, read_exchange, write_exchange
 
 T, H, W, N = 5, 24, 32, 7

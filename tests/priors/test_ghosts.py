@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lerobot_msdyn.priors.ghosts import without_ghosts
+from lerobot_msdyn.priors.masks.ghosts import without_ghosts
 
 FRAMES = 20
 

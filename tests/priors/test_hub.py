@@ -6,8 +6,8 @@ import pytest
 import torch
 from huggingface_hub import constants
 
-from lerobot_msdyn.config import PriorsConfig
-from lerobot_msdyn.errors import PriorError
+from lerobot_msdyn.core.config import PriorsConfig
+from lerobot_msdyn.core.errors import PriorError
 from lerobot_msdyn.priors.hub import (
     LICENCES,
     NON_COMMERCIAL,

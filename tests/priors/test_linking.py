@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lerobot_msdyn.priors.linking import MAX_INSTANCES, numbered
+from lerobot_msdyn.priors.masks.linking import MAX_INSTANCES, numbered
 
 
 def test_the_largest_thing_is_number_one(sliding) -> None:

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from lerobot_msdyn.priors.patches import cut, register, sample
+from lerobot_msdyn.priors.tracks.patches import cut, register, sample
 
 XY = np.array([[30.5, 20.5], [41.0, 33.0], [52.25, 40.75]], np.float32)
 

@@ -9,10 +9,10 @@ import pytest
 import torch
 from huggingface_hub import constants
 
-from lerobot_msdyn.cameras import intrinsics_from_fov, static_camera
-from lerobot_msdyn.config import CameraConfig, PriorsConfig
-from lerobot_msdyn.episode import View
-from lerobot_msdyn.errors import PriorError
+from lerobot_msdyn.core.cameras import intrinsics_from_fov, static_camera
+from lerobot_msdyn.core.config import CameraConfig, PriorsConfig
+from lerobot_msdyn.core.errors import PriorError
+from lerobot_msdyn.dataset.read import View
 from lerobot_msdyn.priors import Priors, estimate_priors
 
 FRAMES = 12

@@ -11,9 +11,9 @@ pytest.importorskip("torchvision")
 
 from torchvision.models.optical_flow import Raft_Small_Weights, raft_small
 
-from lerobot_msdyn.errors import PriorError
-from lerobot_msdyn.priors.raft import RaftFlow, demand_raft, find_raft
-from lerobot_msdyn.priors.tracks import flow_tracks
+from lerobot_msdyn.core.errors import PriorError
+from lerobot_msdyn.priors.tracks.flow import flow_tracks
+from lerobot_msdyn.priors.tracks.raft import RaftFlow, demand_raft, find_raft
 
 PAIR = np.random.default_rng(0).integers(0, 255, (2, 72, 100, 3)).astype(np.uint8)
 

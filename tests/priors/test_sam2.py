@@ -11,9 +11,9 @@ pytest.importorskip("transformers")
 
 from tiny_models import save_edgetam, save_sam2
 
-from lerobot_msdyn.errors import PriorError
+from lerobot_msdyn.core.errors import PriorError
 from lerobot_msdyn.priors.hub import find_model
-from lerobot_msdyn.priors.sam2 import best_frame, sam2_masks
+from lerobot_msdyn.priors.masks.sam2 import best_frame, sam2_masks
 
 
 @pytest.fixture(scope="module")

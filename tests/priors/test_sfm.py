@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_msdyn.cameras import CameraTrack
-from lerobot_msdyn.episode import View
-from lerobot_msdyn.errors import PriorError
-from lerobot_msdyn.geometry import axis_angle_to_matrix, se3
-from lerobot_msdyn.priors.sfm import camera_from_sfm, interpolated_poses
+from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.errors import PriorError
+from lerobot_msdyn.core.geometry import axis_angle_to_matrix, se3
+from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.priors.camera.sfm import camera_from_sfm, interpolated_poses
 from lerobot_msdyn.synthetic import make_scene
 
 FRAMES = 16

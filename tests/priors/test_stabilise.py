@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import torch
 
-from lerobot_msdyn.priors.masks import moving_instances, temporal_median
-from lerobot_msdyn.priors.stabilise import camera_sway, to_frames, to_reference
+from lerobot_msdyn.priors.masks.moving import moving_instances, temporal_median
+from lerobot_msdyn.priors.masks.stabilise import camera_sway, to_frames, to_reference
 
 
 def swaying(images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

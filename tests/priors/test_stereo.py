@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_msdyn.cameras import CameraTrack
-from lerobot_msdyn.geometry import axis_angle_to_matrix, se3
-from lerobot_msdyn.priors.stereo import RectifiedPair
+from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.geometry import axis_angle_to_matrix, se3
+from lerobot_msdyn.priors.depth.stereo import RectifiedPair
 from lerobot_msdyn.synthetic import make_scene
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lerobot_msdyn.priors.votes import votes
+from lerobot_msdyn.priors.masks.votes import votes
 
 
 def test_tracks_tell_a_resting_block_from_its_ground(sliding) -> None:

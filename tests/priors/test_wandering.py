@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import torch
 
-from lerobot_msdyn.priors.masks import moving_instances, temporal_median
-from lerobot_msdyn.priors.wandering import residual_odds
+from lerobot_msdyn.priors.masks.moving import moving_instances, temporal_median
+from lerobot_msdyn.priors.masks.wandering import residual_odds
 
 FRAMES, WIDTH, HEIGHT, PAN = 30, 120, 90, 4
 

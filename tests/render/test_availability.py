@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.utils import cpp_extension
 
-from lerobot_msdyn.errors import ConfigError, RenderError
+from lerobot_msdyn.core.errors import ConfigError, RenderError
 from lerobot_msdyn.render import availability, rasterize
 from lerobot_msdyn.render.availability import cuda_problem
 
@@ -88,8 +88,8 @@ def test_kernels_that_do_not_compile_are_said_in_one_line(machine: pytest.Monkey
 
 
 def test_what_is_missing_is_said_where_the_gpu_was_demanded(machine: pytest.MonkeyPatch) -> None:
-    from lerobot_msdyn.devices import chosen_device
     from lerobot_msdyn.render import backends
+    from lerobot_msdyn.render.devices import chosen_device
 
     machine.setattr(torch.cuda, "is_available", lambda: False)
     backends._load.cache_clear()
@@ -106,14 +106,14 @@ def test_what_is_missing_is_said_where_the_gpu_was_demanded(machine: pytest.Monk
 def test_auto_says_once_why_it_is_not_the_gpu(
     machine: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, available: bool, level: str
 ) -> None:
-    from lerobot_msdyn import devices
+    from lerobot_msdyn.render import devices
 
     devices._say_once.cache_clear()
     machine.setattr(torch.cuda, "is_available", lambda: available)
     machine.setattr(availability.importlib.util, "find_spec", lambda name: None)
     with caplog.at_level("INFO"):
         assert [devices.chosen_device("auto") for _ in range(2)] == [torch.device("cpu")] * 2
-    said = [record for record in caplog.records if record.name == "lerobot_msdyn.devices"]
+    said = [record for record in caplog.records if record.name == "lerobot_msdyn.render.devices"]
     assert [(record.levelname, "fitting and drawing on the CPU" in record.getMessage()) for record in said] == [
         (level, True)
     ]
@@ -124,6 +124,6 @@ def test_auto_says_once_why_it_is_not_the_gpu(
 
 
 def test_auto_takes_the_gpu(machine: pytest.MonkeyPatch) -> None:
-    from lerobot_msdyn.devices import chosen_device
+    from lerobot_msdyn.render.devices import chosen_device
 
     assert [chosen_device(name) for name in ("auto", "cuda")] == [torch.device("cuda")] * 2

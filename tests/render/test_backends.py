@@ -9,7 +9,7 @@ import sys
 import pytest
 import torch
 
-from lerobot_msdyn.errors import RenderError
+from lerobot_msdyn.core.errors import RenderError
 from lerobot_msdyn.render import backends, rasterize
 from lerobot_msdyn.render.validation import check_shapes
 
@@ -130,7 +130,7 @@ from lerobot_msdyn.render import warmup
 from lerobot_msdyn.render.backends import _load
 assert "numba" not in sys.modules, "importing the package imports numba"
 warmup.warm_up([3])
-from lerobot_msdyn.render.simd import LANES
+from lerobot_msdyn.render.cpu.simd import LANES
 print(LANES)
 """
 

@@ -12,7 +12,7 @@ from types import ModuleType
 import pytest
 import torch
 
-from lerobot_msdyn.errors import RenderError
+from lerobot_msdyn.core.errors import RenderError
 from lerobot_msdyn.render import rasterize
 from lerobot_msdyn.render.availability import cuda_problem
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from lerobot_msdyn.errors import RenderError
+from lerobot_msdyn.core.errors import RenderError
 from lerobot_msdyn.render import rasterize
 
 FOCAL = 10.0

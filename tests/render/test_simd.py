@@ -4,8 +4,8 @@ import numba
 import numpy as np
 import pytest
 
-from lerobot_msdyn.render import planes, simd
-from lerobot_msdyn.render.simd import LANES
+from lerobot_msdyn.render.cpu import planes, simd
+from lerobot_msdyn.render.cpu.simd import LANES
 
 VALUES = np.linspace(-3, 4, LANES).astype(np.float32)
 

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_msdyn import saved
-from lerobot_msdyn.geometry import axis_angle_to_matrix, se3
-from lerobot_msdyn.motion.bases import level_from_motions
+from lerobot_msdyn.core.geometry import axis_angle_to_matrix, se3
 from lerobot_msdyn.motion.field import fit_field
-from lerobot_msdyn.perturbation import orbit_offset
-from lerobot_msdyn.rendering import draw
-from lerobot_msdyn.saved import SavedScene
-from lerobot_msdyn.scene import DynamicScene
+from lerobot_msdyn.motion.model.bases import level_from_motions
+from lerobot_msdyn.scene import store as saved
+from lerobot_msdyn.scene.draw import draw
+from lerobot_msdyn.scene.gaussians import DynamicScene
+from lerobot_msdyn.scene.store import SavedScene
 from lerobot_msdyn.training.live import LiveScene, filled
+from lerobot_msdyn.views.perturbation import orbit_offset
 
 
 @pytest.fixture

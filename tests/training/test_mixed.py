@@ -9,9 +9,10 @@ import pytest
 import torch
 from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
 
-from lerobot_msdyn import provenance, saved
-from lerobot_msdyn.config import JitterConfig, OrbitConfig
-from lerobot_msdyn.errors import ConfigError, DatasetError, MsdynError
+from lerobot_msdyn.core.config import JitterConfig, OrbitConfig
+from lerobot_msdyn.core.errors import ConfigError, DatasetError, MsdynError
+from lerobot_msdyn.dataset import provenance
+from lerobot_msdyn.scene import store as saved
 from lerobot_msdyn.training import MixedViews
 
 FRONT, SIDE = "observation.images.front", "observation.images.side"

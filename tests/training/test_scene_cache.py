@@ -3,7 +3,7 @@
 import pickle
 from pathlib import Path
 
-from lerobot_msdyn import saved
+from lerobot_msdyn.scene import store as saved
 from lerobot_msdyn.training.scene_cache import MEGABYTE, SceneCache
 
 FRONT = "observation.images.front"

@@ -1,0 +1,159 @@
+"""Command line: new viewpoints for every episode of a LeRobot dataset.
+
+python -m lerobot_msdyn.augment --repo local/ds
+"""
+
+import logging
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lerobot_msdyn.core.cli import EXIT_INTERRUPTED, EXIT_OK, EXIT_SOME_EPISODES_FAILED, parse_config, run_command
+from lerobot_msdyn.core.config import AugmentConfig
+from lerobot_msdyn.core.errors import ConfigError, EpisodeError
+
+if TYPE_CHECKING:
+    from lerobot.datasets import LeRobotDatasetMetadata
+
+    from lerobot_msdyn.dataset.staging import Staging
+
+logger = logging.getLogger(__name__)
+
+COMMAND = "python -m lerobot_msdyn.augment"
+ALIASES = {"repo": "repo_id"}
+
+
+def run(arguments: list[str]) -> int:
+    """Augment a dataset; returns the exit code."""
+    config = parse_config(AugmentConfig, arguments, ALIASES, command=COMMAND)
+    if not config.repo_id:
+        raise ConfigError(f"which dataset? {COMMAND} --repo NAME [--root FOLDER] (see --help)")
+    # LeRobot and torch take seconds to import: only now, so that --help and bad flags are answered at once.
+    from lerobot.utils.constants import HF_LEROBOT_HOME
+
+    from lerobot_msdyn.dataset.staging import Staging, published_before
+    from lerobot_msdyn.dataset.write import check_place
+
+    root = config.root or HF_LEROBOT_HOME / config.repo_id
+    new_repo_id = config.new_repo_id or f"{config.repo_id}_msdyn"
+    new_root = config.new_root
+    if new_root is None and config.root is not None and config.new_repo_id is None:
+        new_root = config.root.with_name(f"{config.root.name}_msdyn")
+    new_root = new_root or HF_LEROBOT_HOME / new_repo_id
+    skipped = published_before(new_root)
+    if skipped is not None:
+        return _say_skipped(f"written to {new_root} by the run before\n", skipped)
+    check_place(root, new_root)
+    opened = None if config.convert else _open(config, config.root)
+    if opened is not None and config.dry_run:
+        return _say_plan(config, *opened, new_root)
+    with Staging(new_root) as staging:
+        try:
+            if opened is None:
+                opened = _convert(config, root, staging)
+                if config.dry_run:
+                    return _say_plan(config, *opened, new_root)
+            return augment(config, *opened, new_repo_id, new_root, staging)
+        except KeyboardInterrupt:
+            sys.stderr.write(
+                f"interrupted: {staging.finished()} episodes are finished and kept in {staging.folder}; "
+                "the same command goes on from there\n"
+            )
+            return EXIT_INTERRUPTED
+
+
+def _open(config: AugmentConfig, root: Path | None) -> tuple["LeRobotDatasetMetadata", list[int], list[str]]:
+    """The source, its episodes and its cameras."""
+    from lerobot_msdyn.augment.moving_cameras import still_cameras
+    from lerobot_msdyn.dataset.read import open_source, select_cameras, select_episodes
+
+    source = open_source(config.repo_id, root)
+    episodes = select_episodes(source, config.episodes)
+    cameras = select_cameras(source, config.cameras, allow_moving=config.allow_moving)
+    if not config.allow_moving:
+        cameras = still_cameras(source, episodes[0], cameras, config)
+    return source, episodes, cameras
+
+
+def _convert(
+    config: AugmentConfig, root: Path, staging: "Staging"
+) -> tuple["LeRobotDatasetMetadata", list[int], list[str]]:
+    """The same of a converted copy in the work folder."""
+    from lerobot_msdyn.augment.run_identity import all_files, describe_run
+    from lerobot_msdyn.dataset.convert import converted_copy
+
+    staging.agree(describe_run(root, all_files(root), config), restart=config.restart)
+    return _open(config, converted_copy(config.repo_id, root, staging.folder))
+
+
+def augment(
+    config: AugmentConfig,
+    source: "LeRobotDatasetMetadata",
+    episodes: list[int],
+    cameras: list[str],
+    new_repo_id: str,
+    new_root: Path,
+    staging: "Staging",
+) -> int:
+    """Run the job that the command line described and say how it went; returns the exit code."""
+    from lerobot_msdyn.augment.report.build import write_report
+    from lerobot_msdyn.augment.run import run_local
+    from lerobot_msdyn.augment.run_identity import describe_run, recipe_text, source_files
+    from lerobot_msdyn.dataset.provenance import SOURCE_VARIANT
+    from lerobot_msdyn.dataset.write import OutputDataset
+    from lerobot_msdyn.reconstruct.share_background import background_episodes
+    from lerobot_msdyn.views.perturbation import units_of_shifts
+
+    start = time.perf_counter()
+    if not config.convert:
+        files = source_files(source, [*episodes, *background_episodes(source, config)])
+        staging.agree(describe_run(source.root, files, config), restart=config.restart)
+    with OutputDataset(source, new_repo_id, new_root, staging, nvenc=config.nvenc) as output:
+        made, failures = run_local(source, episodes, cameras, config, output)
+        new = [episode for episode in made if not episode.dropped]
+        skipped = [str(failure) for failure in failures]
+        dropped = [f"episode {e.source_index} variant {e.provenance.variant}: {e.dropped}" for e in made if e.dropped]
+        left_out = [f"skipped: {line}" for line in skipped] + [f"dropped: {line}" for line in dropped]
+        if not new:
+            first = [*skipped, *dropped][0]
+            raise EpisodeError(f"no episode could be augmented; nothing was written. First: {first}")
+
+        def report(folder: Path) -> Path:
+            return write_report(source, folder, new_root.name, made, skipped, time.perf_counter() - start)
+
+        output.finish(new, recipe_text(config), left_out, report)
+    rendered = sum(episode.provenance.variant != SOURCE_VARIANT for episode in new)
+    return _say_skipped(
+        f"{len(episodes) - len(failures)} of {len(episodes)} episodes, {rendered} new ones "
+        f"({config.variants} per episode, {', '.join(cameras)}), {time.perf_counter() - start:.0f} s\n"
+        f"{units_of_shifts([episode.provenance.perturbation for episode in made])}"
+        f"written to {new_root}\n"
+        f"look at {new_root / 'report.html'}\n"
+        f"train:  lerobot-train --dataset.repo_id={new_repo_id} --dataset.root={new_root} --policy.type=act "
+        "--policy.push_to_hub=false\n",
+        left_out,
+    )
+
+
+def _say_plan(
+    config: AugmentConfig, source: "LeRobotDatasetMetadata", episodes: list[int], cameras: list[str], new_root: Path
+) -> int:
+    from lerobot_msdyn.augment.run import plan
+
+    sys.stdout.write(plan(source, episodes, cameras, config) + f"would be written to {new_root}\n")
+    return EXIT_OK
+
+
+def _say_skipped(done: str, left_out: list[str]) -> int:
+    sys.stdout.write(done + "".join(f"{line}\n" for line in left_out))
+    return EXIT_SOME_EPISODES_FAILED if left_out else EXIT_OK
+
+
+def main() -> None:
+    """Entry point."""
+    run_command(run)
+
+
+if __name__ == "__main__":
+    main()

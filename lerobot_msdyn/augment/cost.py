@@ -1,0 +1,123 @@
+"""How long a run will take, from a few frames and steps of its first episode."""
+
+import statistics
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from lerobot.datasets import LeRobotDatasetMetadata
+
+from lerobot_msdyn.core.config import Recipe
+from lerobot_msdyn.dataset.encode import stage_pictures
+from lerobot_msdyn.dataset.read import View, read_episode
+from lerobot_msdyn.reconstruct.reconstruct import FURTHER_STEPS, by_feature, reconstruct
+from lerobot_msdyn.reconstruct.share_background import looked_at
+from lerobot_msdyn.render.devices import chosen_device
+from lerobot_msdyn.scene.gaussians import DynamicScene
+from lerobot_msdyn.views.pictures import new_pictures, on_device
+
+PROBE_FRAMES = 24
+PROBE_STEPS = 14
+MASKS_SHARE = 0.3  # of the time of priors and initial scene
+GROWING = ("overlay.", "shading.field", "shading.moving")  # tensors of a scene with a part for every frame
+WARM_UP_STEPS = 4  # the first ones compile, and fill caches
+
+
+@dataclass(frozen=True)
+class Speeds:
+    """Seconds that each part of the work takes, for all cameras together."""
+
+    read_s: float  # per frame
+    prepare_s: float  # per frame: priors and initial scene
+    step_s: float  # per step of the fit
+    render_s: float  # per new frame, encoded
+    scene_bytes: float = 0.0  # of the saved scenes of an episode, however long ...
+    frame_bytes: float = 0.0  # ... and for each of its frames
+
+
+def measure_speeds(source: LeRobotDatasetMetadata, index: int, cameras: list[str], recipe: Recipe) -> Speeds:
+    """Time every stage on the middle of one episode.
+
+    Raises:
+        EpisodeError: the episode cannot be read.
+        PriorError: a prior was demanded and cannot be had.
+    """
+    start = time.perf_counter()
+    episode = read_episode(source, index, cameras, recipe.camera, recorded_depth=recipe.priors.depth != "plane")
+    frames = len(episode.time)
+    read_s = (time.perf_counter() - start) / frames
+    short = replace(
+        recipe,
+        fit=replace(recipe.fit, steps=PROBE_STEPS, held_out_frames=0),
+        priors=replace(recipe.priors, cache="off"),
+    )
+    views = episode.views
+    if not recipe.needs_whole_videos:
+        views = {key: _middle(view) for key, view in views.items()}
+    prepare_s = step_s = render_s = scene_bytes = frame_bytes = 0.0
+    for key, part in views.items():
+        ticks: list[float] = []
+
+        def tick(share: float, to: list[float] = ticks) -> None:
+            to.append(time.perf_counter())
+
+        start = time.perf_counter()
+        others = [other for name, other in views.items() if name != key]
+        scene = reconstruct(part, short, tick, others=others, episode=index, key=key)
+        prepare_s += (time.perf_counter() - start - scene.seconds) / len(part.rgb)
+        steps = [
+            after - before for before, after in zip(ticks[WARM_UP_STEPS:], ticks[WARM_UP_STEPS + 1 :], strict=False)
+        ]
+        step_s += statistics.median(steps)
+        once, each = _saved_sizes(scene.results[0].scene)
+        scene_bytes, frame_bytes = scene_bytes + once, frame_bytes + each
+        with tempfile.TemporaryDirectory() as folder:
+            start = time.perf_counter()
+            drawn = on_device(scene, chosen_device(recipe.device))
+            pictures = by_feature(source, {key: new_pictures(drawn, part.camera)})
+            stage_pictures(source, Path(folder), pictures, len(part.rgb))
+            render_s += (time.perf_counter() - start) / len(part.rgb)
+    return Speeds(read_s, prepare_s, step_s, render_s, scene_bytes, frame_bytes)
+
+
+def predicted_scene_bytes(speeds: Speeds, source: LeRobotDatasetMetadata, episodes: list[int], recipe: Recipe) -> float:
+    """Disk for the saved scenes of a whole run; a window of a long episode has a scene of its own."""
+    lengths = [int(source.episodes[index]["length"]) for index in episodes]
+    windows = sum(-(-frames // recipe.fit.window_frames) for frames in lengths)
+    return windows * speeds.scene_bytes + sum(lengths) * speeds.frame_bytes
+
+
+def predicted_seconds(
+    speeds: Speeds, source: LeRobotDatasetMetadata, episodes: list[int], recipe: Recipe, workers: int = 1
+) -> float:
+    """Time of a whole run by so many workers; `speeds` are those of one, on its share of the cores."""
+    steps, background_s = float(recipe.fit.steps), 0.0
+    if recipe.scene.shared_background and source.total_episodes > 1:
+        indices = looked_at(source.total_episodes)
+        apart = len(set(indices) - set(episodes))  # the masks of the others serve for their own fit as well
+        masks_s = (len(indices) * speeds.read_s + apart * MASKS_SHARE * speeds.prepare_s) / workers
+        each_s = len(indices) * speeds.read_s + masks_s
+        background_s = each_s * source.total_frames / source.total_episodes + steps / 2 * speeds.step_s
+        steps *= FURTHER_STEPS
+    busy_s = [0.0] * workers
+    for index in episodes:
+        frames = int(source.episodes[index]["length"])
+        windows = -(-frames // recipe.fit.window_frames)
+        one_s = frames * (speeds.read_s + speeds.prepare_s + recipe.variants * speeds.render_s)
+        busy_s[busy_s.index(min(busy_s))] += one_s + windows * steps * speeds.step_s
+    return background_s + max(busy_s)
+
+
+def _saved_sizes(scene: DynamicScene) -> tuple[float, float]:
+    """Bytes of a scene that do not grow with its length, and those of each frame."""
+    sizes = {name: tensor.nbytes for name, tensor in scene.tensors().items()}
+    growing = sum(size for name, size in sizes.items() if name.startswith(GROWING))
+    return float(sum(sizes.values()) - growing), growing / scene.frames
+
+
+def _middle(view: View) -> View:
+    start = max(0, (len(view.rgb) - PROBE_FRAMES) // 2)
+    part = slice(start, start + PROBE_FRAMES)
+    depth = None if view.depth is None else view.depth[part]
+    return View(view.rgb[part], view.camera.select(part), depth, view.depth_range)

@@ -1,0 +1,82 @@
+"""Cameras that move with the robot, whose pictures are tied to its state, are told from the others by their motion."""
+
+import itertools
+import logging
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+from lerobot.datasets import LeRobotDatasetMetadata
+from numpy import ndarray
+from torch import Tensor
+
+from lerobot_msdyn.core.config import Recipe
+from lerobot_msdyn.core.errors import DatasetError, EpisodeError
+from lerobot_msdyn.dataset.read import Episode, read_episode
+from lerobot_msdyn.priors.camera.steadiness import SWAY_PX, camera_motion_px
+
+logger = logging.getLogger(__name__)
+
+CORRELATED = 0.4  # of the picture's motion with the robot's
+EVEN = 0.1  # relative spread of the picture's speed up to which it moves evenly: nothing to correlate
+MIN_PAIRS = 8
+SMALL_PX = 160  # width at which pictures are compared
+
+
+def still_cameras(source: LeRobotDatasetMetadata, index: int, cameras: list[str], recipe: Recipe) -> list[str]:
+    """Those of the cameras that do not move with the robot in an episode; the others were left out, with the reason.
+
+    Raises:
+        DatasetError: one that the recipe names moves, or no camera is left.
+    """
+    try:
+        episode = read_episode(source, index, cameras, recipe.camera, recorded_depth=False)
+    except EpisodeError:  # reported when it is its turn
+        return cameras
+    moving = {key: reason for key in cameras if (reason := why_moving(episode, key))}
+    for key, reason in moving.items():
+        message = f"{source.repo_id}: {key} is refused: {reason} (--allow_moving re-renders it all the same)"
+        if recipe.cameras is not None or len(moving) == len(cameras):
+            raise DatasetError(message)
+        logger.warning(message)
+    return [key for key in cameras if key not in moving]
+
+
+def why_moving(episode: Episode, key: str) -> str:
+    """Why a camera is taken to move with the robot; empty if it is not.
+
+    The background must move by more than a camera on a stand sways, and the whole picture when the robot does; a
+    camera that moves without the robot's doing (held in a hand) is not tied to the state.
+    """
+    rgb = episode.views[key].rgb
+    motion = camera_motion_px(rgb) * (320 / rgb.shape[2])
+    if motion <= SWAY_PX:
+        return ""
+    if episode.state is None:
+        return f"its background moves by {motion:.1f} px (of 320), and no state says whether with the robot"
+    together = correlation(episode.state, rgb)
+    if together < CORRELATED:
+        return ""
+    return f"its background moves by {motion:.1f} px (of 320) with the robot (correlation {together:.2f})"
+
+
+def correlation(state: Float[Tensor, "t s"], rgb: UInt8[Tensor, "t h w 3"]) -> float:
+    """How much the speed of the whole picture (phase correlation) goes with that of the state, -1..1; 0: unknown."""
+    pairs = min(len(rgb) - 1, 60)
+    if pairs < MIN_PAIRS:
+        return 0.0
+    frames = np.linspace(0, len(rgb) - 1, pairs + 1).round().astype(int)
+    spread = state.std(0).clamp(min=1e-6)
+    speed = (state[frames[1:]] - state[frames[:-1]]).div(spread).norm(dim=1).numpy()
+    small = [_small(rgb[int(frame)]) for frame in frames]
+    window = cv2.createHanningWindow(small[0].shape[::-1], cv2.CV_32F)
+    shift = np.array([np.hypot(*cv2.phaseCorrelate(a, b, window)[0]) for a, b in itertools.pairwise(small)])
+    if speed.std() < 1e-6 or shift.std() <= EVEN * shift.mean():
+        return 0.0
+    return float(np.corrcoef(speed, shift)[0, 1])
+
+
+def _small(image: UInt8[Tensor, "h w 3"]) -> ndarray:
+    grey = cv2.cvtColor(image.numpy(), cv2.COLOR_RGB2GRAY).astype(np.float32)
+    height = max(1, round(grey.shape[0] * SMALL_PX / grey.shape[1]))
+    return cv2.resize(grey, (SMALL_PX, height), interpolation=cv2.INTER_AREA)

@@ -1,0 +1,130 @@
+"""From a finished run to report.html beside its output.
+
+The page is bounded: pictures of at most PICTURED views (half of them the ones with the lowest scores), about 0.4 MB
+each, and page.LISTED rows of text.
+"""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from lerobot.datasets import LeRobotDatasetMetadata
+
+from lerobot_msdyn.augment.report.page import Pictures, ViewEntry, page
+from lerobot_msdyn.augment.report.pictures import (
+    CLIP_FRAMES,
+    STRIP_FRAMES,
+    data_url,
+    film,
+    heat_map,
+    spread,
+    strip,
+)
+from lerobot_msdyn.dataset.provenance import SOURCE_VARIANT
+from lerobot_msdyn.dataset.read import open_source, read_colour, read_rows
+from lerobot_msdyn.dataset.write import NewEpisode
+
+logger = logging.getLogger(__name__)
+
+NAME = "report.html"
+PICTURED = 16  # views with pictures
+
+
+def write_report(
+    source: LeRobotDatasetMetadata,
+    root: Path,
+    name: str,
+    episodes: Sequence[NewEpisode],
+    skipped: Sequence[str],
+    seconds: float,
+) -> Path:
+    """Write the report of a dataset that was just written; returns its path.
+
+    Args:
+        source: the dataset whose episodes were re-rendered.
+        root: folder of the new dataset.
+        name: its name in the page.
+        episodes: all of a run in order, the dropped ones among them.
+        skipped: why source episodes were left out, one line each.
+        seconds: what the run took.
+    """
+    entries, places = _entries(episodes)
+    output = open_source(source.repo_id, root)
+    for i in sorted(_pictured(entries)):
+        entry = entries[i]
+        entries[i] = replace(entry, pictures=_pictures(source, output, places[i], entry))
+    path = root / NAME
+    path.write_text(page(name, _figures(episodes, entries, skipped, seconds), entries, skipped), encoding="utf-8")
+    return path
+
+
+def _entries(episodes: Sequence[NewEpisode]) -> tuple[list[ViewEntry], dict[int, int]]:
+    """All views, and for those that were kept the episode of the output."""
+    entries: list[ViewEntry] = []
+    places: dict[int, int] = {}
+    index = 0
+    for episode in episodes:
+        origin = episode.provenance
+        if origin.variant != SOURCE_VARIANT:
+            for camera, view in origin.gate["views"].items():
+                if not episode.dropped:
+                    places[len(entries)] = index
+                drawn, rejected = origin.perturbation[camera], origin.gate["rejected"]
+                view = view | origin.views[camera]
+                dropped = bool(episode.dropped)
+                entries.append(ViewEntry(episode.source_index, origin.variant, camera, drawn, view, rejected, dropped))
+        index += not episode.dropped
+    return entries, places
+
+
+def _pictured(entries: Sequence[ViewEntry]) -> set[int]:
+    """Which views get pictures: those with the lowest scores, and the first ones."""
+    kept = [i for i, entry in enumerate(entries) if not entry.dropped]
+    worst = set(sorted(kept, key=lambda i: entries[i].score)[: PICTURED // 2])
+    return worst | set([i for i in kept if i not in worst][: PICTURED - len(worst)])
+
+
+def _pictures(source: LeRobotDatasetMetadata, output: LeRobotDatasetMetadata, index: int, entry: ViewEntry) -> Pictures:
+    """Strip, clip and map of one view, from the two datasets' own pictures."""
+    before, after = (
+        read_colour(meta, number, entry.camera, read_rows(meta, number)).numpy()
+        for meta, number in ((source, entry.episode), (output, index))
+    )
+    few, many = (spread(len(before), count) for count in (STRIP_FRAMES, CLIP_FRAMES))
+    moving = film(list(before[many]), list(after[many]))
+    scores = entry.view.get("scores")
+    heat = None if scores is None else data_url(heat_map(after[len(after) // 2], scores["heat"]))
+    return Pictures(
+        data_url(strip(list(before[few]), list(after[few]))),
+        data_url(moving),
+        len(many),
+        moving.shape[1] / len(many) / moving.shape[0],
+        heat,
+    )
+
+
+def _figures(
+    episodes: Sequence[NewEpisode], entries: Sequence[ViewEntry], skipped: Sequence[str], seconds: float
+) -> dict[str, str]:
+    """What the page says at its top."""
+    made = [episode for episode in episodes if episode.provenance.variant != SOURCE_VARIANT]
+    scores = [entry.score for entry in entries if not entry.dropped and np.isfinite(entry.score)]
+    fitting: dict[tuple[int, str], float] = {}
+    for episode in made:
+        fitting |= {(episode.source_index, key): s for key, s in episode.seconds.items() if key.startswith("fitting ")}
+    return {
+        "new episodes": str(sum(not episode.dropped for episode in made)),
+        "dropped by the gate": str(sum(bool(episode.dropped) for episode in made)),
+        "source episodes skipped": str(len(skipped)),
+        "draws rejected": str(sum(len(episode.provenance.gate["rejected"]) for episode in made)),
+        "expected quality, median": f"{np.median(scores):.1f} dB" if scores else "not judged",
+        "all in all": _time(seconds),
+        "in fitting": _time(sum(fitting.values())),
+        "in judging": _time(sum(episode.seconds["judging"] for episode in made)),
+    }
+
+
+def _time(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.1f} min"

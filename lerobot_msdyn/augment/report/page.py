@@ -1,0 +1,220 @@
+"""The page itself: one HTML file with everything in it; every text from outside is escaped."""
+
+import html
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from lerobot_msdyn.augment.report.drawing import cameras_from_above
+
+LISTED = 1000  # rows of the table, at most
+DRAWN_POSES = 8  # of a camera that moves along the episode, about
+STYLE = """
+:root{--ink:#1c2330;--soft:#5c6675;--line:#dde2e8;--paper:#fff;--back:#f5f6f8;--new:#c2351f;--good:#1d7a46}
+*{box-sizing:border-box}
+body{margin:0;background:var(--back);color:var(--ink);font:15px/1.5 system-ui,"Segoe UI",Roboto,sans-serif}
+main{max-width:1180px;margin:0 auto;padding:24px 20px 60px}
+h1{font-size:26px;line-height:1.25;margin:0 0 4px}h2{font-size:20px;margin:36px 0 12px}
+h3{font-size:16px;margin:0;overflow-wrap:anywhere}
+p{margin:0 0 10px}.soft{color:var(--soft)}
+.figures{display:grid;grid-template-columns:repeat(auto-fit,minmax(128px,1fr));gap:12px;margin:18px 0}
+.figures div{background:var(--paper);border:1px solid var(--line);border-radius:8px;padding:10px 14px}
+.figures b{display:block;font-size:22px;font-weight:600}
+article{background:var(--paper);border:1px solid var(--line);border-radius:8px;padding:16px;margin:0 0 18px}
+.head{display:flex;flex-wrap:wrap;gap:4px 14px;align-items:baseline;justify-content:space-between;margin-bottom:12px}
+.score{font-weight:600;color:var(--good)}.dropped .score,.why{color:var(--new)}
+.grid{display:grid;grid-template-columns:2fr 1fr 1fr;gap:16px;margin-top:14px;align-items:start}
+figure{margin:0;min-width:0}figcaption{color:var(--soft);font-size:13px;margin-top:4px}
+img,svg{display:block;width:100%;height:auto;border-radius:4px}
+.film{width:100%;background-size:calc(100% * var(--frames)) 100%;border-radius:4px;
+animation:film calc(var(--frames) * .16s) steps(var(--frames),jump-none) infinite}
+@keyframes film{from{background-position:0 0}to{background-position:100% 0}}
+@media (prefers-reduced-motion:reduce){.film{animation:none}}
+svg{background:var(--back);max-width:320px}
+.why{margin:12px 0 0}
+svg .recorded{fill:#8b95a3;stroke:#8b95a3}svg .new{fill:var(--new);stroke:var(--new)}
+svg polygon.recorded{fill:none;stroke-width:2}
+svg .sight{stroke-width:1;stroke-dasharray:3 4;opacity:.6}svg .target{fill:none;stroke:var(--ink);stroke-width:1.5}
+.scroll{overflow-x:auto}
+table{border-collapse:collapse;width:100%;font-size:14px;background:var(--paper)}
+th,td{text-align:left;padding:6px 10px;border-bottom:1px solid var(--line);white-space:nowrap}
+td.text{white-space:normal;min-width:220px;overflow-wrap:anywhere}
+th{color:var(--soft);font-weight:600}
+dl{display:grid;grid-template-columns:repeat(auto-fill,minmax(136px,1fr));gap:8px 16px;margin:14px 0 0}
+dl .wide{grid-column:span 2}
+dt{color:var(--soft);font-size:13px}dd{margin:0;font-weight:600}
+ul{margin:8px 0 0;padding-left:20px}li{overflow-wrap:anywhere}
+details{margin-top:12px}summary{cursor:pointer;color:var(--soft)}
+@media (max-width:760px){main{padding:16px 12px 40px}h1{font-size:22px}.grid{grid-template-columns:1fr 1fr}
+.grid figure:first-child{grid-column:span 2}article{padding:12px}}
+"""
+# Score -> (name, how it is written).
+NAMES = {
+    "expected_db": ("expected quality", "{:.1f} dB"),
+    "held_out_db": ("recorded view, held-out frames", "{:.1f} dB"),
+    "held_out_ssim": ("the same, SSIM", "{:.3f}"),
+    "moving_db": ("the same, what moves", "{:.1f} dB"),
+    "unseen": ("never seen", "{:.1%}"),
+    "angle_deg": ("change of the line of sight", "{:.1f}°"),
+    "track_px": ("tracks to motion", "{:.1f} px"),
+    "flicker_ratio": ("flicker, of the video's", "{:.2f}"),
+    "sharpness_ratio": ("sharpness, of the video's", "{:.2f}"),
+}
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Pictures of one view, as data URLs."""
+
+    strip: str
+    film: str
+    film_frames: int
+    ratio: float  # width by height of one step of the film
+    heat: str | None
+
+
+@dataclass(frozen=True)
+class ViewEntry:
+    """One new episode by one camera."""
+
+    episode: int  # of the source
+    variant: int
+    camera: str
+    drawn: dict[str, float]  # the change of view
+    view: dict[str, Any]  # camera_from_source, distance_m, and scores if it was judged
+    rejected: list[str]  # reasons of the draws before
+    dropped: bool
+    pictures: Pictures | None = None
+
+    @property
+    def score(self) -> float:
+        """Expected quality in dB; views that were not judged come last."""
+        return float(self.view.get("scores", {}).get("expected_db", float("inf")))
+
+
+def page(title: str, figures: dict[str, str], entries: Sequence[ViewEntry], skipped: Sequence[str]) -> str:
+    """The whole report.
+
+    Args:
+        title: name of the dataset.
+        figures: what to say at the top, by name.
+        entries: all views; those with pictures are shown at length.
+        skipped: why source episodes were left out, one line each.
+    """
+    shown = [entry for entry in entries if entry.pictures is not None or entry.dropped]
+    top = "".join(f"<div><b>{text(value)}</b>{text(name)}</div>" for name, value in figures.items())
+    left_out = ""
+    if skipped:
+        left_out = "<h2>Skipped episodes</h2>" + bullets(skipped)
+    more = len(entries) - min(len(entries), LISTED)
+    rest = f"<p class=soft>{more} more are in meta/msdyn/episodes.parquet.</p>" if more else ""
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width,initial-scale=1">'
+        f"<title>{text(title)}</title><style>{STYLE}</style></head><body><main>"
+        f'<h1>{text(title)}</h1><p class="soft">Left and above: recorded. Right and below: rendered from the new '
+        "camera. Scores are estimates: no true picture of the new views exists.</p>"
+        f'<div class="figures">{top}</div>{left_out}'
+        f"<h2>Views</h2>{''.join(_article(entry) for entry in shown[:LISTED])}"
+        f'<h2>All views</h2><div class="scroll">{_table(entries[:LISTED])}</div>{rest}'
+        "</main></body></html>\n"
+    )
+
+
+def text(value: object) -> str:
+    """Text that is safe in the page, also inside quotes."""
+    return html.escape(str(value), quote=True)
+
+
+def bullets(lines: Iterable[str]) -> str:
+    """A list."""
+    return "<ul>" + "".join(f"<li>{text(line)}</li>" for line in lines) + "</ul>"
+
+
+def _article(entry: ViewEntry) -> str:
+    verdict = "dropped" if entry.dropped else "kept"
+    scores = entry.view.get("scores")
+    score = f"{scores['expected_db']:.1f} dB expected, {verdict}" if scores else verdict
+    why = ""
+    if entry.rejected:
+        name = "Why it was dropped" if entry.dropped else "Drawn again, since"
+        why = f'<p class="why">{name}:</p>{bullets(dict.fromkeys(entry.rejected))}'
+    return (
+        f'<article class="{verdict}"><div class="head"><h3>Episode {entry.episode}, variant {entry.variant}, '
+        f'{text(entry.camera)}</h3><span class="score">{text(score)}</span></div>{_pictures(entry)}'
+        f"{_scores(scores) if scores else ''}{why}{_frames(scores['frames']) if scores else ''}</article>"
+    )
+
+
+def _pictures(entry: ViewEntry) -> str:
+    change = text(", ".join(_with_unit(name, value) for name, value in entry.drawn.items()))
+    above = (
+        f"<figure>{cameras_from_above(_poses(entry.view['camera_from_source']), entry.view['distance_m'])}"
+        f"<figcaption>From above: recorded camera grey, new one red. {change}</figcaption></figure>"
+    )
+    pictures = entry.pictures
+    if pictures is None:
+        return f'<div class="grid">{above}</div>'
+    heat = ""
+    if pictures.heat:
+        heat = (
+            f'<figure><img src="{pictures.heat}" alt="where the new view shows what nobody has seen">'
+            "<figcaption>Red: never seen, filled in</figcaption></figure>"
+        )
+    return (
+        f'<figure class="strip"><img src="{pictures.strip}" alt="recorded above, new below"></figure>'
+        '<div class="grid"><figure><div class="film" role="img" aria-label="clip: recorded left, new right" '
+        f'style="--frames:{pictures.film_frames};aspect-ratio:{pictures.ratio:.4f};'
+        f"background-image:url('{pictures.film}')\"></div>"
+        f"<figcaption>Recorded left, new right</figcaption></figure>{heat}{above}</div>"
+    )
+
+
+def _poses(matrices: list[Any]) -> list[Any]:
+    """A few of a camera's poses: one, or some along an episode in which it moves."""
+    every = max(1, len(matrices) // DRAWN_POSES)
+    return matrices[::every] if isinstance(matrices[0][0], list) else [matrices]
+
+
+def _with_unit(name: str, value: float) -> str:
+    """What was drawn, in words: its name ends in its unit."""
+    for ending, unit in (("_deg", "°"), ("_m", " m"), ("_rel", " of the distance")):
+        if name.endswith(ending):
+            return f"{name.removesuffix(ending).replace('_', ' ')} {value:.3g}{unit}"
+    return f"{name.replace('_', ' ')} {value:.3g}"
+
+
+def _scores(scores: dict[str, Any]) -> str:
+    items = "".join(
+        f"<div><dt>{name}</dt><dd>{text(form.format(scores[key]))}</dd></div>" for key, (name, form) in NAMES.items()
+    )
+    cause = ", ".join(f"{name} {share:.0%}" for name, share in scores["causes"].items())
+    return f'<dl>{items}<div class="wide"><dt>expected error from</dt><dd class="soft">{text(cause)}</dd></div></dl>'
+
+
+def _frames(frames: Sequence[dict[str, Any]]) -> str:
+    rows = "".join(
+        f"<tr><td>{frame['frame']:.0f}</td><td>{frame['expected_db']:.1f} dB</td><td>{frame['unseen']:.1%}</td>"
+        f"<td>{frame['angle_deg']:.1f}°</td><td>{frame['sharpness_ratio']:.2f}</td></tr>"
+        for frame in frames
+    )
+    head = "<tr><th>frame</th><th>expected</th><th>never seen</th><th>angle</th><th>sharpness</th></tr>"
+    return f'<details><summary>Judged frames</summary><div class="scroll"><table>{head}{rows}</table></div></details>'
+
+
+def _table(entries: Sequence[ViewEntry]) -> str:
+    head = (
+        "<tr><th>episode</th><th>variant</th><th>camera</th><th>expected</th><th>never seen</th><th>redrawn</th>"
+        "<th>verdict</th></tr>"
+    )
+    rows = []
+    for entry in entries:
+        scores = entry.view.get("scores")
+        values = (f"{scores['expected_db']:.1f} dB", f"{scores['unseen']:.1%}") if scores else ("not judged", "")
+        verdict = f"dropped: {entry.rejected[-1]}" if entry.dropped else "kept"
+        redrawn = len(entry.rejected) - int(entry.dropped)
+        rows.append(
+            f"<tr><td>{entry.episode}</td><td>{entry.variant}</td><td>{text(entry.camera)}</td><td>{values[0]}</td>"
+            f'<td>{values[1]}</td><td>{redrawn}</td><td class="text">{text(verdict)}</td></tr>'
+        )
+    return f"<table>{head}{''.join(rows)}</table>"

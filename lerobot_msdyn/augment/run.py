@@ -1,0 +1,151 @@
+"""Who runs which episode: this process, or several on this machine."""
+
+import contextlib
+import functools
+import logging
+import sys
+from collections.abc import Callable, Generator
+from dataclasses import replace
+
+import torch
+from lerobot.datasets import LeRobotDatasetMetadata
+from tqdm import tqdm
+from tqdm.contrib.logging import logging_redirect_tqdm
+
+from lerobot_msdyn.augment.cost import measure_speeds, predicted_scene_bytes, predicted_seconds
+from lerobot_msdyn.augment.workers import Work, Workers, threads_of_one, workers_for
+from lerobot_msdyn.core.config import AugmentConfig
+from lerobot_msdyn.core.errors import EpisodeError, MsdynError
+from lerobot_msdyn.dataset.read import depth_key_of
+from lerobot_msdyn.dataset.video import quiet_encoders
+from lerobot_msdyn.dataset.write import NewEpisode, OutputDataset
+from lerobot_msdyn.reconstruct.reconstruct import augment_episode
+from lerobot_msdyn.render.devices import chosen_device
+
+logger = logging.getLogger(__name__)
+
+UNWATCHED_S = 30.0  # between updates of a progress bar that nobody watches
+
+
+def run_local(
+    source: LeRobotDatasetMetadata,
+    episodes: list[int],
+    cameras: list[str],
+    config: AugmentConfig,
+    output: OutputDataset,
+) -> tuple[list[NewEpisode], list[EpisodeError]]:
+    """All episodes on this machine; an episode that cannot be read is reported and left out."""
+    chosen_device(config.device)  # complains, or says what is used, before anything is done
+    quiet_encoders()
+    _say_what_is_assumed(source, cameras, config)
+    new: list[NewEpisode] = []
+    failures: list[EpisodeError] = []
+    bar_format = "{desc} |{bar}| {percentage:3.0f} % of {total} episodes [{elapsed}<{remaining}]"
+    watched = sys.stderr.isatty()  # in a file a bar has a line per update
+    interval_s = 0.1 if watched else UNWATCHED_S
+    with logging_redirect_tqdm(), tqdm(total=len(episodes), bar_format=bar_format, mininterval=interval_s) as bar:
+
+        def progress(what: str, share: float) -> None:
+            if what:
+                bar.set_description_str(what, refresh=watched)
+            bar.update(min(share, len(episodes) - bar.n))  # shares add up to one only up to rounding
+
+        bar.set_description_str("looking at the background", refresh=watched)
+        work = Work(source, cameras, config, output, progress)
+        with contextlib.closing(_attempts(work, episodes)) as attempts:  # workers end before the lock is let go
+            for index, failure in zip(episodes, attempts, strict=True):
+                if failure is None:
+                    new += output.finish_episode(index, _make(work, index))
+                else:
+                    failures.append(EpisodeError(failure))
+        bar.update(len(episodes) - bar.n)
+    return new, failures
+
+
+def _attempts(work: Work, episodes: list[int]) -> Generator[str | None]:
+    """Why each episode failed, or nothing; by this process or, where that pays, by several."""
+    unfinished = [index for index in episodes if not work.output.is_finished(index)]
+    frames = sum(int(work.source.episodes[index]["length"]) for index in unfinished)
+    count = workers_for(work.config, frames, len(unfinished))
+    if count == 1:
+        for index in episodes:
+            yield attempt(work, index)
+        return
+    logger.info("%d episodes at once (--workers)", count)
+    with Workers(count, work) as workers:
+        _ = replace(work, run=workers.moving).backgrounds  # before they are asked for by all at once
+        yield from workers.map(attempt, episodes)
+
+
+def attempt(work: Work, index: int) -> str | None:
+    """Finish one episode; returns why that is not possible."""
+    make = _make(work, index)
+    try:
+        work.output.finish_episode(index, make)
+    except EpisodeError as error:
+        logger.error("skipped: %s", error)
+        return str(error)
+    except MsdynError:
+        raise
+    except torch.OutOfMemoryError:
+        logger.error("skipped episode %d: the memory of the GPU is full", index)
+        name = f"{work.source.repo_id} episode {index}"
+        return f"{name}: the memory of the GPU is full; try fewer --workers, or a smaller --fit.max_width"
+    except Exception as error:  # hours of other episodes' work must not be lost to a fault in one
+        logger.exception("skipped episode %d: a fault of lerobot_msdyn, please report it", index)
+        return f"{work.source.repo_id} episode {index}: {type(error).__name__}: {error}"
+    return None
+
+
+def _make(work: Work, index: int) -> Callable[[], list[NewEpisode]]:
+    """What makes all new episodes of one."""
+    return functools.partial(
+        augment_episode,
+        work.source,
+        index,
+        work.cameras,
+        work.config,
+        work.output,
+        work.progress,
+        work.backgrounds,
+    )
+
+
+def plan(source: LeRobotDatasetMetadata, episodes: list[int], cameras: list[str], config: AugmentConfig) -> str:
+    """What a run would do: episodes, pictures, disk and time, the last by doing a little of it."""
+    frames = sum(int(source.episodes[index]["length"]) for index in episodes)
+    copies = config.variants + int(config.include_source)
+    size = sum(file.stat().st_size for file in source.root.rglob("*") if file.is_file())
+    disk = size * frames * copies / max(source.total_frames, 1)
+    count = workers_for(config, frames, len(episodes))
+    with threads_of_one(count):
+        speeds = measure_speeds(source, episodes[0], cameras, config)
+    seconds = predicted_seconds(speeds, source, episodes, config, count)
+    scenes = predicted_scene_bytes(speeds, source, episodes, config) if config.save_scenes else 0.0
+    with_scenes = f", {scenes / 1e6:.0f} MB of it saved scenes" if scenes else ""
+    return (
+        f"{source.repo_id}: {len(episodes)} episodes, {frames} frames; re-rendering {', '.join(cameras)}\n"
+        f"{config.variants} new per episode: {len(episodes) * copies} episodes, {frames * copies} frames, "
+        f"{frames * config.variants * len(cameras)} new pictures\n"
+        f"about {(disk + scenes) / 1e6:.0f} MB on disk{with_scenes}, and about {seconds / 60:.1f} minutes "
+        f"on this machine, by {count} {'process' if count == 1 else 'processes'}, judging by a few frames and steps\n"
+    )
+
+
+def _say_what_is_assumed(source: LeRobotDatasetMetadata, cameras: list[str], config: AugmentConfig) -> None:
+    """Once per run: what nobody measured."""
+    logger.info("%s: re-rendering %s", source.repo_id, ", ".join(cameras))
+    if config.camera.calibration is None:
+        logger.warning(
+            "no calibration: cameras are taken as fixed, with a horizontal field of view of %g degrees "
+            "(--camera.calibration FILE, --camera.horizontal_fov_deg)",
+            config.camera.horizontal_fov_deg,
+        )
+    if config.priors.depth == "auto" and not all(depth_key_of(source, key) for key in cameras):
+        logger.warning(
+            "no recorded depth: unless a learned model or several calibrated cameras supply it, scenes are built on a "
+            "table plane seen from %g m at %g degrees (--camera.height_m, --camera.tilt_deg); keep the changes of view "
+            "small",
+            config.camera.height_m,
+            config.camera.tilt_deg,
+        )

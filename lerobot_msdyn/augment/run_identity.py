@@ -1,0 +1,87 @@
+"""What the result of a run depends on, so that a run that was stopped goes on only as itself."""
+
+import dataclasses
+import hashlib
+import importlib.metadata
+import platform
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import draccus
+import yaml
+from lerobot.datasets import LeRobotDatasetMetadata
+
+from lerobot_msdyn.core.config import AugmentConfig, Recipe
+from lerobot_msdyn.core.files import DIGEST_BYTES, digest_of_file
+from lerobot_msdyn.dataset.checks import place_problem
+from lerobot_msdyn.render.devices import chosen_device
+
+LIBRARIES = ("lerobot_msdyn", "lerobot", "torch", "numpy", "opencv-python-headless", "av", "numba", "pyarrow")
+PLACES = ("root", "new_root", "dry_run", "restart", "workers")  # settings that do not change what is made
+
+
+def describe_run(root: Path, files: Iterable[Path], config: AugmentConfig) -> dict[str, Any]:
+    """Settings, digests of all files that are read, the device and versions, as JSON.
+
+    Args:
+        root: the folder of the source.
+        files: those of its files that are read.
+        config: the settings.
+
+    Raises:
+        ConfigError: they demand a device that cannot be used.
+    """
+    settings = {key: value for key, value in draccus.encode(config).items() if key not in PLACES}
+    settings["priors"].pop("cache")
+    return {
+        "recipe": settings,
+        "device": chosen_device(config.device).type,
+        "source": {str(path.relative_to(root)): digest_of_file(path) for path in files},
+        "files": {str(path): digest_of_file(path) for path in _named_files(settings)},
+        "versions": versions() | {"code": code_digest()},
+    }
+
+
+def all_files(root: Path) -> list[Path]:
+    """All files of a folder."""
+    return sorted(path for path in root.rglob("*") if not path.is_dir())
+
+
+def source_files(source: LeRobotDatasetMetadata, episodes: Iterable[int]) -> list[Path]:
+    """The metadata of a dataset and the files that some of its episodes lie in."""
+    files = {path for path in all_files(source.root / "meta") if "msdyn" not in path.parts}
+    for index in episodes:
+        if place_problem(source.episodes[index], source.video_keys) is None:
+            files.add(source.root / source.get_data_file_path(index))
+            files.update(source.root / source.get_video_file_path(index, key) for key in source.video_keys)
+    return sorted(files)
+
+
+def versions() -> dict[str, str]:
+    """The versions of this package, of Python, and of the libraries that decide on pixels and files."""
+    return {name: importlib.metadata.version(name) for name in LIBRARIES} | {"python": platform.python_version()}
+
+
+def code_digest() -> str:
+    """Changes whenever a module of this package does."""
+    total = hashlib.blake2b(digest_size=DIGEST_BYTES)
+    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
+        total.update(path.read_bytes())
+    return total.hexdigest()
+
+
+def recipe_text(config: Recipe) -> str:
+    """The settings as a recipe file, without the user's folders."""
+    known = {item.name for item in dataclasses.fields(Recipe)}
+    settings = {key: value for key, value in draccus.encode(config).items() if key in known}
+    settings["priors"].pop("cache")
+    return yaml.safe_dump(settings)
+
+
+def _named_files(settings: Any) -> list[Path]:
+    """The files that settings name: calibrations, exchange files, weights."""
+    if isinstance(settings, dict):
+        return [path for value in settings.values() for path in _named_files(value)]
+    is_file = isinstance(settings, str) and Path(settings).suffix != "" and Path(settings).is_file()
+    return [Path(settings)] if is_file else []

@@ -1,0 +1,54 @@
+"""A converted copy of a dataset of version v2.1; the source stays as it is."""
+
+import logging
+import shutil
+from pathlib import Path
+
+from lerobot.scripts.convert_dataset_v21_to_v30 import convert_dataset
+
+from lerobot_msdyn.core.errors import DatasetError
+from lerobot_msdyn.core.files import temporary_files_in, writing
+from lerobot_msdyn.dataset.checks import check_features, read_json, regular_file
+from lerobot_msdyn.dataset.rows import first_line
+
+logger = logging.getLogger(__name__)
+
+LEGACY_VERSION = "v2.1"
+
+
+def converted_copy(repo_id: str, root: Path, folder: Path) -> Path:
+    """Copy a dataset into a work folder and convert it there with LeRobot's script; done once.
+
+    Raises:
+        DatasetError: it is not of version v2.1, names files outside of itself, or LeRobot cannot convert it.
+        OutputError: the work folder cannot be written.
+    """
+    done = folder / "converted"
+    if done.exists():
+        return done
+    info = read_json(root, "meta/info.json")
+    version = info.get("codebase_version")
+    if version != LEGACY_VERSION:
+        raise DatasetError(f"{root} is a LeRobot dataset of version {version}; --convert takes {LEGACY_VERSION} only")
+    check_features(info.get("features"), root / "meta" / "info.json")
+    logger.info("converting a copy of %s from %s", root, LEGACY_VERSION)
+    copy = folder / "converting" / "dataset"
+    with writing(folder), temporary_files_in(folder):
+        shutil.rmtree(copy.parent, ignore_errors=True)
+        for path in sorted(root.rglob("*")):
+            if not path.is_dir():
+                target = copy / path.relative_to(root)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(regular_file(root, path.relative_to(root)), target)
+    level = logging.root.manager.disable
+    logging.disable(logging.WARNING)  # LeRobot tells about every field that only the old version had
+    try:
+        with temporary_files_in(folder):
+            convert_dataset(repo_id, root=copy, push_to_hub=False)
+    except Exception as error:  # several libraries read the files, each with errors of its own
+        raise DatasetError(f"{root} cannot be converted by LeRobot's script ({first_line(error)})") from error
+    finally:
+        logging.disable(level)
+    copy.rename(done)
+    shutil.rmtree(copy.parent)
+    return done

@@ -1,0 +1,134 @@
+"""What made each episode of an output dataset, kept in its meta/msdyn/."""
+
+import hashlib
+import importlib.metadata
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.errors import DatasetError, OutputError
+from lerobot_msdyn.core.files import write_whole
+
+FOLDER = Path("meta") / "msdyn"
+TABLE = FOLDER / "episodes.parquet"
+RECIPE = FOLDER / "recipe.yaml"
+SOURCE_VARIANT = -1  # the variant of an episode that was copied, not rendered
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where one episode of the output came from and how it was made."""
+
+    source_repo_id: str
+    source_episode: int
+    variant: int  # SOURCE_VARIANT for a copy of the source's episode
+    seed: int
+    perturbation: dict[str, dict[str, float]] = field(default_factory=dict)  # camera -> what was drawn
+    priors: dict[str, dict[str, dict[str, str]]] = field(
+        default_factory=dict
+    )  # camera -> prior -> provider, why, model
+    views: dict[str, dict[str, Any]] = field(default_factory=dict)  # camera -> its `camera_pose`
+    gate: dict[str, Any] = field(default_factory=dict)  # scores and what was rejected, see docs/quality.md
+
+
+def camera_pose(source: CameraTrack, new: CameraTrack) -> dict[str, Any]:
+    """A new camera for the record: K (px), and camera_from_source, which maps the recorded camera's axes to its (m).
+
+    One 3x3 and one 4x4 matrix where they are the same at every frame, else one per frame; rounded to 1e-6.
+    """
+    change = new.camera_from_world.double() @ source.world_from_camera.double()
+    return {"K": _once(new.intrinsics), "camera_from_source": _once(change)}
+
+
+def _once(matrices: Float[Tensor, "t n n"]) -> list[Any]:
+    rounded = (matrices.double() * 1e6).round() / 1e6
+    return list((rounded[0] if bool((rounded == rounded[:1]).all()) else rounded).tolist())
+
+
+def write_unseen(root: Path, index: int, masks: Mapping[str, np.ndarray]) -> None:
+    """Write meta/msdyn/unseen/episode_000012.npz: the arrays of `UnseenMasks`."""
+    path = root / FOLDER / "unseen" / f"episode_{index:06d}.npz"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    arrays: dict[str, Any] = dict(masks)
+    np.savez_compressed(path, **arrays)
+
+
+def read_unseen(path: Path, camera: str) -> Bool[np.ndarray, "t h w"]:
+    """One camera's masks of a file that `write_unseen` wrote: True where nothing was ever seen.
+
+    Raises:
+        OutputError: it is not such a file, or does not have the camera.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return np.unpackbits(file[camera], axis=-1, count=int(file[f"{camera}.width"])).astype(bool)
+    except (OSError, ValueError, KeyError) as error:
+        raise OutputError(f"{path}: no masks of {camera!r} there ({error}); they are kept with --masks") from error
+
+
+def merged(entries: Sequence[dict[str, dict[str, str]]]) -> dict[str, dict[str, str]]:
+    """What is known about the priors of a video's windows, as one: where they differ, all that was said, in order."""
+    names = dict.fromkeys(name for entry in entries for name in entry)
+    together: dict[str, dict[str, str]] = {}
+    for name in names:
+        found = [entry[name] for entry in entries if name in entry]
+        keys = dict.fromkeys(key for some in found for key in some)
+        together[name] = {key: "; ".join(dict.fromkeys(some[key] for some in found if key in some)) for key in keys}
+    return together
+
+
+def write_provenance(root: Path, episodes: Sequence[Provenance], recipe_yaml: str) -> None:
+    """Write meta/msdyn/episodes.parquet (one row per episode) and the recipe that was used."""
+    common = {
+        "recipe_sha256": hashlib.sha256(recipe_yaml.encode()).hexdigest(),
+        "version": importlib.metadata.version("lerobot_msdyn"),
+        "lerobot_version": importlib.metadata.version("lerobot"),
+    }
+    rows = []
+    for episode in episodes:
+        row = {key: json.dumps(value) if isinstance(value, dict) else value for key, value in asdict(episode).items()}
+        rows.append(row | {"licences": json.dumps(licences(episode.priors))} | common)
+    write_rows(root, rows)
+    write_whole(root / RECIPE, recipe_yaml.encode())
+
+
+def write_rows(root: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Write meta/msdyn/episodes.parquet; the row of an episode is that of its number."""
+    buffer = pa.BufferOutputStream()
+    pq.write_table(pa.Table.from_pylist([{"episode_index": i} | row for i, row in enumerate(rows)]), buffer)
+    write_whole(root / TABLE, buffer.getvalue().to_pybytes())
+
+
+def read_provenance(root: Path) -> list[dict[str, Any]] | None:
+    """The rows of meta/msdyn/episodes.parquet in the order of the episodes; None if there is no such file.
+
+    Raises:
+        DatasetError: it is damaged, or not one row per episode.
+    """
+    path = root / TABLE
+    if not path.is_file():
+        return None
+    try:
+        rows: list[dict[str, Any]] = pq.read_table(path).to_pylist()
+        rows = sorted(rows, key=lambda row: row["episode_index"])
+        complete = [(row["episode_index"], bool(row["source_repo_id"]), row["source_episode"] >= 0) for row in rows]
+    except (OSError, KeyError, TypeError, pa.ArrowException) as error:
+        raise DatasetError(f"{path} cannot be read ({type(error).__name__})") from error
+    if complete != [(i, True, True) for i in range(len(rows))]:
+        raise DatasetError(f"{path}: expected one row for each of episodes 0 to {len(rows) - 1}, with its source")
+    return rows
+
+
+def licences(priors: dict[str, dict[str, dict[str, str]]]) -> dict[str, str]:
+    """Licence by learned model, of all models that took part."""
+    used = [prior for camera in priors.values() for prior in camera.values() if "model" in prior]
+    return {prior["model"]: prior.get("licence", "unknown") for prior in used}

@@ -1,0 +1,396 @@
+"""Read LeRobot episodes into plain tensors: pixels, cameras, recorded depth, state and action."""
+
+import io
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import PIL.Image
+import pyarrow as pa
+import torch
+from jaxtyping import Float, UInt8
+from lerobot.configs import DepthEncoderConfig
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.datasets.depth_utils import dequantize_depth
+from lerobot.datasets.video_utils import decode_video_frames
+from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, OBS_STATE
+from torch import Tensor
+
+from lerobot_msdyn.core.cameras import CameraTrack, intrinsics_from_fov, read_calibration, static_camera
+from lerobot_msdyn.core.config import CameraConfig
+from lerobot_msdyn.core.errors import DatasetError, EpisodeError
+from lerobot_msdyn.dataset.checks import check_metadata, picture_size, read_json
+from lerobot_msdyn.dataset.chroma import is_subsampled, restore_chroma
+from lerobot_msdyn.dataset.rows import TIMESTAMP_TOLERANCE_S, first_line, read_rows, source_file, task_of
+
+VIDEO_BACKEND = "pyav"
+CODEBASE_VERSION = "v3.0"
+# What a broken video can cause; AttributeError: a stream of an unknown codec has no context.
+VIDEO_ERRORS = (av.FFmpegError, OSError, ValueError, RuntimeError, IndexError, AttributeError)
+BLOCK_FRAMES = 128  # that are decoded at once
+MILLIMETRES = 1000.0
+ON_ROBOT = ("wrist", "hand", "gripper", "palm", "finger", "effector", "flange", "tool")  # in names of cameras
+
+
+@dataclass(frozen=True)
+class View:
+    """What one camera recorded."""
+
+    rgb: UInt8[Tensor, "t h w 3"]
+    camera: CameraTrack
+    depth: Float[Tensor, "t h w"] | None = None  # m, z-depth; as recorded, see `depth_range`
+    depth_range: tuple[float, float] = (0.0, float("inf"))  # m; values at the ends mean "not measured"
+
+
+@dataclass(frozen=True)
+class EpisodeSource:
+    """Where an episode came from."""
+
+    repo_id: str
+    root: Path
+    index: int
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One recorded episode; the views are those that were asked for."""
+
+    source: EpisodeSource
+    fps: int | float
+    time: Float[Tensor, " t"]  # s since the episode's start
+    views: dict[str, View]
+    state: Float[Tensor, "t s"] | None
+    action: Float[Tensor, "t a"] | None
+    task: str
+
+    def __len__(self) -> int:
+        return self.time.shape[0]
+
+
+def open_source(repo_id: str, root: Path | None = None) -> LeRobotDatasetMetadata:
+    """The metadata of a dataset in `root`, else in LeRobot's home, else on the hub. Nothing is written to `root`.
+
+    Raises:
+        DatasetError: there is no such dataset, it is not of version v3.0, or its metadata is not what it should be.
+    """
+    folder = HF_LEROBOT_HOME / repo_id if root is None else root
+    if not (folder / "meta" / "info.json").exists():
+        if root is not None:
+            raise DatasetError(
+                f"no dataset in {root}: {root / 'meta' / 'info.json'} is absent; "
+                "--root is the exact folder that holds meta/, data/ and videos/"
+            )
+        folder = _from_hub(repo_id, folder)
+    check_version(folder)
+    check_metadata(folder)
+    try:
+        return LeRobotDatasetMetadata(repo_id, folder)
+    except Exception as error:  # several libraries read the metadata, each with errors of its own
+        raise DatasetError(f"{folder}: the dataset's meta/ cannot be read ({first_line(error)})") from error
+
+
+def _from_hub(repo_id: str, folder: Path) -> Path:
+    """Where LeRobot put a dataset that it downloaded."""
+    try:
+        return LeRobotDatasetMetadata(repo_id).root
+    except Exception as error:
+        raise DatasetError(
+            f"no dataset {repo_id!r}: not in {folder}, and the hub does not have it or cannot be reached "
+            f"({type(error).__name__}); give its folder with --root"
+        ) from error
+
+
+def check_version(root: Path) -> None:
+    """Whether a dataset is of the version that this LeRobot reads.
+
+    Raises:
+        DatasetError: it is not; the way to convert it is named.
+    """
+    version = read_json(root, "meta/info.json").get("codebase_version")
+    if version == "v2.1":
+        todo = "add --convert to work on a converted copy of it (the source stays as it is)"
+    elif str(version).startswith(("v1", "v2")):
+        todo = "convert it to v2.1 with an older LeRobot first, then add --convert"
+    else:
+        todo = "use a LeRobot and an lerobot_msdyn that know this version"
+    if version != CODEBASE_VERSION:
+        raise DatasetError(f"{root} is a LeRobot dataset of version {version}; expected {CODEBASE_VERSION}; {todo}")
+
+
+def select_episodes(meta: LeRobotDatasetMetadata, episodes: list[int] | None) -> list[int]:
+    """The episodes asked for, each once and in order; all of them if none are named.
+
+    Raises:
+        DatasetError: an index is out of range.
+    """
+    if episodes is None:
+        return list(range(meta.total_episodes))
+    bad = [index for index in episodes if not 0 <= index < meta.total_episodes]
+    if bad:
+        raise DatasetError(
+            f"{meta.repo_id}: no episode {', '.join(map(str, bad))}; "
+            f"it has {meta.total_episodes} (0 to {meta.total_episodes - 1})"
+        )
+    return sorted(set(episodes))
+
+
+def colour_cameras(meta: LeRobotDatasetMetadata) -> list[str]:
+    """Feature keys of the colour cameras."""
+    return [key for key in meta.camera_keys if key not in meta.depth_keys]
+
+
+def select_cameras(meta: LeRobotDatasetMetadata, cameras: list[str] | None, *, allow_moving: bool = False) -> list[str]:
+    """The cameras to re-render: those asked for (by key or its last part), else all that are not on the robot.
+
+    Raises:
+        DatasetError: a name is unknown or of a camera on the robot, or no camera is left.
+    """
+    known = colour_cameras(meta)
+    if cameras is None:
+        chosen = [key for key in known if allow_moving or not is_wrist_camera(key)]
+        if not chosen:
+            raise DatasetError(
+                f"{meta.repo_id}: no camera to re-render; its colour cameras are {', '.join(known) or 'none'}"
+            )
+        return chosen
+    chosen = []
+    for name in cameras:
+        matches = [key for key in known if name in (key, key.rsplit(".", 1)[-1])]
+        if not matches:
+            raise DatasetError(f"{meta.repo_id}: no colour camera {name!r}; it has {', '.join(known) or 'none'}")
+        chosen += [key for key in matches if key not in chosen]
+    on_robot = [key for key in chosen if is_wrist_camera(key)]
+    if on_robot and not allow_moving:
+        raise DatasetError(
+            f"{meta.repo_id}: {', '.join(on_robot)} moves with the robot, by its name: its picture is tied to the "
+            "state, and would belong to another one; leave it out, or allow it by --allow_moving"
+        )
+    return chosen
+
+
+def is_wrist_camera(key: str) -> bool:
+    """Whether a camera's name says that it moves with the robot."""
+    name = key.rsplit(".", 1)[-1].lower()
+    return any(word in name for word in ON_ROBOT)
+
+
+def read_episode(
+    meta: LeRobotDatasetMetadata, index: int, cameras: list[str], config: CameraConfig, *, recorded_depth: bool = True
+) -> Episode:
+    """One episode with the views of `cameras`, at full size.
+
+    Raises:
+        EpisodeError: a file of the episode is absent or damaged.
+        PriorError: the calibration file cannot be used.
+    """
+    rows = read_rows(meta, index)
+    time = torch.from_numpy(rows["timestamp"].to_numpy().astype(np.float32))
+    views = {}
+    for key in cameras:
+        rgb = read_colour(meta, index, key, rows)
+        depth, depth_range = None, (0.0, float("inf"))
+        depth_key = depth_key_of(meta, key)
+        if recorded_depth and depth_key is not None:
+            depth, depth_range = read_depth(meta, index, depth_key, rows)
+            if depth.shape != rgb.shape[:3]:
+                raise EpisodeError(
+                    f"{meta.repo_id} episode {index}: {depth_key} is {tuple(depth.shape[1:])}, "
+                    f"its camera {tuple(rgb.shape[1:3])}; "
+                    "only depth that is aligned to the colour image can be used (--priors.depth plane goes without)"
+                )
+        views[key] = View(rgb, make_camera(key, index, rgb, config), depth, depth_range)
+    return Episode(
+        source=EpisodeSource(meta.repo_id, meta.root, index),
+        fps=meta.fps,
+        time=time - time[0],
+        views=views,
+        state=_matrix(rows, OBS_STATE),
+        action=_matrix(rows, ACTION),
+        task=task_of(meta, rows),
+    )
+
+
+def make_camera(key: str, index: int, rgb: UInt8[Tensor, "t h w 3"], config: CameraConfig) -> CameraTrack:
+    """The calibrated camera, or a fixed one with the configured field of view."""
+    frames, height, width = rgb.shape[:3]
+    if config.calibration is not None:
+        camera = read_calibration(config.calibration, key, index, frames, width, height)
+        if camera is not None:
+            return camera
+    return static_camera(intrinsics_from_fov(width, height, config.horizontal_fov_deg), frames, width, height)
+
+
+def shrink(view: View, max_width: int) -> View:
+    """The same video with at most `max_width` columns; depth keeps its values (nearest pixel)."""
+    height, width = view.rgb.shape[1:3]
+    if width <= max_width:
+        return view
+    size = (max_width, round(height * max_width / width))
+    rgb = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in view.rgb.numpy()])
+    depth: Float[Tensor, "t h w"] | None = None
+    if view.depth is not None:
+        images = [cv2.resize(image, size, interpolation=cv2.INTER_NEAREST) for image in view.depth.numpy()]
+        depth = torch.from_numpy(np.stack(images))
+    return View(torch.from_numpy(rgb), view.camera.resized(*size), depth, view.depth_range)
+
+
+def depth_key_of(meta: LeRobotDatasetMetadata, camera: str) -> str | None:
+    """The feature that holds the recorded depth of a colour camera, if there is one (`<camera>_depth`)."""
+    return next((key for key in meta.depth_keys if key == f"{camera}_depth"), None)
+
+
+def read_colour(meta: LeRobotDatasetMetadata, index: int, key: str, rows: pa.Table) -> UInt8[Tensor, "t h w 3"]:
+    """All frames of one colour camera; chroma that was recorded at half the size is restored (`chroma`).
+
+    Raises:
+        EpisodeError: a frame is absent or cannot be decoded.
+    """
+    if key in meta.video_keys:
+        restored = restore_chroma if is_subsampled(meta.features[key]) else Tensor.contiguous
+        return _decode_video(meta, index, key, rows, lambda block: restored(block.movedim(1, -1)))
+    images = [_decode_image(meta, index, key, item, cv2.IMREAD_COLOR_RGB) for item in rows[key].to_pylist()]
+    return torch.from_numpy(np.stack(images))
+
+
+def read_depth(
+    meta: LeRobotDatasetMetadata, index: int, key: str, rows: pa.Table
+) -> tuple[Float[Tensor, "t h w"], tuple[float, float]]:
+    """All frames of one recorded depth camera in metres, and the range whose ends mean "not measured".
+
+    Raises:
+        EpisodeError: a frame is absent or cannot be decoded.
+    """
+    if key in meta.video_keys:
+        encoder = _depth_encoder(meta, key)
+
+        def in_metres(block: Tensor) -> Tensor:
+            depth = dequantize_depth(
+                block,
+                depth_min=encoder.depth_min,
+                depth_max=encoder.depth_max,
+                shift=encoder.shift,
+                use_log=encoder.use_log,
+                output_unit="m",
+            )
+            return depth[:, 0].float()
+
+        depth = _decode_video(meta, index, key, rows, in_metres, is_depth=True)
+        return depth, (encoder.depth_min, encoder.depth_max)
+    images = [_decode_image(meta, index, key, item, cv2.IMREAD_UNCHANGED) for item in rows[key].to_pylist()]
+    depth = torch.from_numpy(np.stack(images).astype(np.float32))
+    return depth / depth_units_per_metre(meta, key), (0.0, float("inf"))
+
+
+def _depth_encoder(meta: LeRobotDatasetMetadata, key: str) -> DepthEncoderConfig:
+    try:
+        return DepthEncoderConfig.from_video_info(meta.features[key].get("info") or {})
+    except (ValueError, TypeError) as error:
+        raise EpisodeError(
+            f"{meta.repo_id}: {key} cannot be read with the settings in its info ({first_line(error)})"
+        ) from error
+
+
+def _decode_video(
+    meta: LeRobotDatasetMetadata,
+    index: int,
+    key: str,
+    rows: pa.Table,
+    wanted: Callable[[Tensor], Tensor],
+    *,
+    is_depth: bool = False,
+) -> Tensor:
+    """What is wanted of all frames of a video, made from some [b,c,h,w] at a time, so that it is in memory once."""
+    path = source_file(meta, index, meta.get_video_file_path(index, key))
+    start = float(meta.episodes[index][f"videos/{key}/from_timestamp"])
+    timestamps = [start + float(t) for t in rows["timestamp"].to_pylist()]
+    where = f"{meta.repo_id} episode {index}, {key}"
+    height, width, _ = picture_size(meta.features[key])
+    frames: Tensor | None = None
+    try:
+        _check_stream(path, width, height)
+        for first in range(0, len(timestamps), BLOCK_FRAMES):
+            decoded = decode_video_frames(
+                path,
+                timestamps[first : first + BLOCK_FRAMES],
+                TIMESTAMP_TOLERANCE_S,
+                VIDEO_BACKEND,
+                return_uint8=True,
+                is_depth=is_depth,
+            )
+            block = wanted(decoded)
+            if frames is None:
+                frames = block.new_empty(len(timestamps), *block.shape[1:])
+            frames[first : first + len(block)] = block
+    except DatasetError as error:
+        raise EpisodeError(f"{where}: {error}") from error
+    except (*VIDEO_ERRORS, TypeError) as error:  # TypeError: settings of the depth's codes
+        raise EpisodeError(
+            f"{where}: {path} cannot be decoded for all of its {len(timestamps)} frames ({first_line(error)})"
+        ) from error
+    if frames is None:
+        raise EpisodeError(f"{where}: the episode has no frames")
+    return frames
+
+
+def _check_stream(path: Path, width: int, height: int) -> None:
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0].codec_context
+        if (stream.width, stream.height) != (width, height):
+            raise DatasetError(
+                f"{path} is {stream.width}x{stream.height}; meta/info.json says {width}x{height}: correct its shape"
+            )
+
+
+def _decode_image(meta: LeRobotDatasetMetadata, index: int, key: str, item: Any, flags: int) -> np.ndarray:
+    """One image of an image feature: the bytes in the parquet row, else the file that it names inside the dataset."""
+    where = f"{meta.repo_id} episode {index}, {key}"
+    content, name = (item or {}).get("bytes"), (item or {}).get("path")
+    if content is None:
+        if not name:
+            raise EpisodeError(f"{where}: a frame has no image")
+        content = source_file(meta, index, Path(name)).read_bytes()
+    height, width, _ = picture_size(meta.features[key])
+    try:
+        with PIL.Image.open(io.BytesIO(content)) as header:
+            size = header.size
+    except (OSError, ValueError, SyntaxError, PIL.Image.DecompressionBombError) as error:
+        raise EpisodeError(f"{where}: an image of {len(content)} bytes cannot be decoded") from error
+    if size != (width, height):
+        raise EpisodeError(
+            f"{where}: an image is {size[0]}x{size[1]}; meta/info.json says {width}x{height}: correct its shape"
+        )
+    image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    if image is None:
+        raise EpisodeError(f"{where}: an image of {len(content)} bytes cannot be decoded")
+    return image
+
+
+def picture_channels(meta: LeRobotDatasetMetadata, key: str) -> int:
+    """How many channels a picture feature has: 1, 3 or 4."""
+    return picture_size(meta.features[key])[2]
+
+
+def encode_image(image: np.ndarray, suffix: str) -> bytes:
+    """An image file's content: colours uint8 [h,w,3] or [h,w,4], or grey or depth [h,w] as it is stored."""
+    if image.ndim == 3:
+        image = cv2.cvtColor(image, cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA)
+    ok, content = cv2.imencode(suffix, image)
+    if not ok:
+        raise EpisodeError(f"an image of shape {image.shape} cannot be encoded as {suffix}")
+    return bytes(content.tobytes())
+
+
+def depth_units_per_metre(meta: LeRobotDatasetMetadata, key: str) -> float:
+    """How many of the units in which a depth feature was recorded make a metre (LeRobot's default: millimetres)."""
+    return 1.0 if (meta.features[key].get("info") or {}).get("depth_unit") == "m" else MILLIMETRES
+
+
+def _matrix(rows: pa.Table, key: str) -> Float[Tensor, "t n"] | None:
+    if key not in rows.column_names:
+        return None
+    values = np.stack([np.atleast_1d(np.asarray(item, np.float32)) for item in rows[key].to_pylist()])
+    return torch.from_numpy(values)

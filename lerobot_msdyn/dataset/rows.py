@@ -1,0 +1,109 @@
+"""The parquet rows of one episode, bit for bit, once they are what the metadata says."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from lerobot.datasets import LeRobotDatasetMetadata
+
+from lerobot_msdyn.core.errors import DatasetError, EpisodeError
+from lerobot_msdyn.dataset.checks import PICTURE_DTYPES, TEXT_DTYPES, place_problem, regular_file
+
+TIMESTAMP_TOLERANCE_S = 1e-4  # LeRobot's
+KINDS = {"b": "b", "i": "iu", "u": "iu", "f": "fiu"}  # kind of a feature's dtype -> kinds that its cells may have
+
+
+def read_rows(meta: LeRobotDatasetMetadata, index: int) -> pa.Table:
+    """The rows of one episode, in order.
+
+    Raises:
+        EpisodeError: the data file is absent or damaged, or its rows are not what the metadata says.
+    """
+    where = f"{meta.repo_id} episode {index}"
+    row = meta.episodes[index]
+    problem = place_problem(row, meta.video_keys)
+    if problem is not None:
+        raise EpisodeError(f"{where}: meta/episodes says that {problem}")
+    path = source_file(meta, index, meta.get_data_file_path(index))
+    try:
+        rows = pq.read_table(path, filters=[("episode_index", "=", index)])
+    except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
+        raise EpisodeError(f"{where}: {path} cannot be read ({first_line(error)})") from error
+    expected = int(row["length"])
+    if rows.num_rows != expected or expected == 0:
+        raise EpisodeError(f"{where}: {path} has {rows.num_rows} rows; expected {expected}")
+    columns = {key for key, feature in meta.features.items() if feature["dtype"] != "video"}
+    if columns != set(rows.column_names):
+        lacking, unknown = columns - set(rows.column_names), set(rows.column_names) - columns
+        raise EpisodeError(
+            f"{where}: {path} lacks the columns [{', '.join(sorted(lacking))}] and has [{', '.join(sorted(unknown))}], "
+            "which meta/info.json does not list"
+        )
+    rows = rows.sort_by("frame_index") if pa.types.is_integer(rows["frame_index"].type) else rows
+    problem = _rows_problem(rows, meta)
+    if problem is not None:
+        raise EpisodeError(f"{where}: in {path}, {problem}")
+    return rows
+
+
+def source_file(meta: LeRobotDatasetMetadata, index: int, relative: Path) -> Path:
+    """A file that an episode lies in.
+
+    Raises:
+        EpisodeError: it is absent, no file, or outside of the dataset.
+    """
+    try:
+        return regular_file(meta.root, relative)
+    except DatasetError as error:
+        raise EpisodeError(f"{meta.repo_id} episode {index}: {error}") from error
+
+
+def task_of(meta: LeRobotDatasetMetadata, rows: pa.Table) -> str:
+    """What the robot was told to do in the first row."""
+    tasks = meta.tasks
+    return str(tasks.index[tasks["task_index"] == rows["task_index"][0].as_py()][0])
+
+
+def values_of(rows: pa.Table, key: str, feature: dict[str, Any]) -> np.ndarray:
+    """A numeric column [t, ...] in the type that its feature names."""
+    return np.asarray(rows[key].to_pylist(), dtype=feature["dtype"])
+
+
+def _rows_problem(rows: pa.Table, meta: LeRobotDatasetMetadata) -> str | None:
+    count = rows.num_rows
+    for key, feature in meta.features.items():
+        if feature["dtype"] in PICTURE_DTYPES + TEXT_DTYPES:
+            continue
+        kind = np.asarray(rows[key].to_pylist()[:1]).dtype.kind if rows[key].null_count == 0 else "O"
+        if kind not in KINDS[np.dtype(feature["dtype"]).kind] + "O":
+            return f"{key} holds {rows[key].type}; meta/info.json says {feature['dtype']}"
+        try:
+            values = values_of(rows, key, feature)
+        except (TypeError, ValueError, OverflowError):
+            return f"{key} has empty or uneven cells; expected {feature['dtype']} of shape {list(feature['shape'])}"
+        shape = tuple(feature["shape"])
+        if values.shape[1:] != shape and not (shape == (1,) and values.ndim == 1):
+            return f"{key} has shape {list(values.shape[1:])}; expected {list(shape)}"
+        if values.dtype.kind == "f" and not np.isfinite(values).all():
+            bad = int((~np.isfinite(values).reshape(count, -1)).any(1).sum())
+            return f"{key} is not a number in {bad} of {count} rows; remove this episode from the source, or repair it"
+    for key in meta.image_keys:
+        if not pa.types.is_struct(rows[key].type) or {"bytes", "path"} - {item.name for item in rows[key].type}:
+            return f"{key} holds {rows[key].type}; expected images"
+    if rows["frame_index"].to_pylist() != list(range(count)):
+        return f"frame_index does not go from 0 to {count - 1}"
+    late = np.abs(rows["timestamp"].to_numpy() - np.arange(count) / meta.fps).max()
+    if late > TIMESTAMP_TOLERANCE_S:
+        return f"timestamps are up to {late:.4f} s from frame_index / fps ({meta.fps} frames per second)"
+    known = set(meta.tasks["task_index"].tolist())
+    unknown = set(pc.unique(rows["task_index"]).to_pylist()) - known
+    return f"task_index is {min(unknown)}; meta/tasks.parquet has no such task" if unknown else None
+
+
+def first_line(error: BaseException) -> str:
+    """An error of a library in one line."""
+    text = str(error).strip()
+    return f"{type(error).__name__}: {text.splitlines()[0]}" if text else type(error).__name__

@@ -1,0 +1,221 @@
+"""The work folder of a run: what is finished is kept, so that a run that was stopped goes on where it was.
+
+    .<output>.partial/
+      lock                        held while a run works here
+      run.json                    what is made, from what: recipe, digests of the source's files, versions
+      backgrounds.safetensors     what the episodes of a camera show together
+      episodes/000003/
+        copied.safetensors        the source's own pictures: files (in copied/) and statistics
+        scene_<camera>.safetensors    a fitted scene
+        variant_00.safetensors    one new episode: files (in variant_00/), statistics, provenance
+        finished.safetensors      all new episodes of this one; the scenes are removed
+      converted/                  the source, where it had to be converted
+      dataset/                    the dataset as it is put together, always anew
+      published.json              written right before the dataset is moved to its place
+
+Every file is complete or absent. A value is read back from its file also in the run that made it, so that a run that
+was stopped computes with the same bits as one that was not.
+"""
+
+import json
+import logging
+import os
+import shutil
+import socket
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from lerobot_msdyn.core.errors import OutputError
+from lerobot_msdyn.core.files import write_whole, writing
+from lerobot_msdyn.core.serialise import ValueFileError, load_value, save_value
+
+logger = logging.getLogger(__name__)
+
+FINISHED = "finished"
+SCENE = "scene"
+PUBLISHED = "published.json"
+WORTH_KEEPING = (SCENE, "variant", FINISHED)  # what takes long to make
+MAX_NAMED = 5  # differences that a message lists
+
+
+def work_folder(root: Path) -> Path:
+    """Where the dataset that will lie in `root` is prepared."""
+    return root.with_name(f".{root.name}.partial")
+
+
+class Kept:
+    """A folder of values that are computed once."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def keep(self, name: str, make: Callable[[], Any]) -> Any:
+        """The value of this name: from its file, else from `make`, which is then kept.
+
+        A value is any that `save_value` can write. Files that it names must lie in this folder.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        path = self._path(name)
+        if path.exists():
+            try:
+                return load_value(path, self.folder)
+            except ValueFileError as error:
+                logger.warning("%s; it is made again", error)
+        value = make()
+        with writing(path):
+            save_value(path, value, self.folder)
+        return load_value(path, self.folder)
+
+    def has(self, name: str) -> bool:
+        """Whether the value is there."""
+        return self._path(name).exists()
+
+    def forget(self, kind: str) -> None:
+        """Remove the values whose names begin with `kind`."""
+        for path in self.folder.glob(f"{kind}_*.safetensors"):
+            path.unlink()
+
+    def _path(self, name: str) -> Path:
+        return self.folder / f"{name}.safetensors"
+
+
+class Staging(Kept):
+    """The work folder of one output, locked. Use as a context; leaving it keeps what is there."""
+
+    def __init__(self, root: Path, *, lock: bool = True) -> None:
+        """Make and lock the folder.
+
+        Args:
+            root: the place of the output.
+            lock: false in a process that works for the one that holds the lock.
+
+        Raises:
+            OutputError: another run holds it, or it cannot be written.
+        """
+        super().__init__(work_folder(root))
+        if not lock:
+            return
+        owner = self.folder / "owner"
+        self._lock = FileLock(self.folder / "lock")
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._lock.acquire(timeout=0)
+            owner.write_text(f"process {os.getpid()} on {socket.gethostname()}")
+        except Timeout as error:
+            who = owner.read_text() if owner.exists() else "another process"
+            raise OutputError(
+                f"{root} is being written by {who}; wait for it, or choose another --new_repo_id or --new_root"
+            ) from error
+        except OSError as error:
+            raise OutputError(
+                f"{self.folder} cannot be written ({error.strerror}); choose another --new_root"
+            ) from error
+
+    def __enter__(self) -> "Staging":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Unlock the folder; it goes if nothing in it is worth keeping."""
+        episodes = self.folder / "episodes"
+        if not any(found for name in WORTH_KEEPING for found in episodes.glob(f"*/{name}*.safetensors")):
+            self.remove()
+        self._lock.release()
+
+    def episode(self, index: int) -> Kept:
+        """What is kept of one source episode."""
+        return Kept(self.folder / "episodes" / f"{index:06d}")
+
+    def finished(self) -> int:
+        """How many episodes are finished."""
+        return sum(1 for _ in (self.folder / "episodes").glob(f"*/{FINISHED}.safetensors"))
+
+    def agree(self, run: dict[str, Any], *, restart: bool = False) -> None:
+        """Go on with what is here if it is the same run, else begin anew where nothing is, or on request.
+
+        Args:
+            run: what the result depends on, as JSON.
+            restart: whether what is here is thrown away.
+
+        Raises:
+            OutputError: what is here belongs to another run; what differs is named.
+        """
+        path = self.folder / "run.json"
+        if restart:
+            self.clear()
+        if path.exists():
+            before = self._read(path)
+            changes = differences(before, run)
+            if changes:
+                more = f", and {len(changes) - MAX_NAMED} more" if len(changes) > MAX_NAMED else ""
+                raise OutputError(
+                    f"{self.folder} holds an unfinished run that was started differently: "
+                    f"{'; '.join(changes[:MAX_NAMED])}{more}. Start it as before to go on, add --restart to throw away "
+                    "what it holds, or choose another --new_repo_id"
+                )
+            logger.info("going on with the unfinished run in %s: %d episodes are done", self.folder, self.finished())
+            return
+        self.clear()
+        with writing(path):
+            write_whole(path, json.dumps(run, indent=1, sort_keys=True).encode())
+
+    def publish(self, folder: Path, root: Path, skipped: Sequence[str]) -> None:
+        """Move a finished dataset to its place and remove this folder."""
+        write_whole(self.folder / PUBLISHED, json.dumps(list(skipped)).encode())
+        folder.rename(root)
+        self.remove()
+
+    def _read(self, path: Path) -> Any:
+        try:
+            return json.loads(path.read_text())
+        except (OSError, ValueError):
+            return {}
+
+    def clear(self) -> None:
+        """Remove everything but the lock."""
+        for path in self.folder.iterdir():
+            if path.is_dir():
+                shutil.rmtree(path)
+            elif path.name not in ("lock", "owner"):
+                path.unlink()
+
+    def remove(self) -> None:
+        """Remove the folder."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def published_before(root: Path) -> list[str] | None:
+    """What a run skipped that moved its dataset to `root` and was stopped right then; what it left is removed.
+
+    None where that is not so.
+    """
+    path = work_folder(root) / PUBLISHED
+    if not root.exists() or not path.exists() or (path.parent / "dataset").exists():
+        return None
+    with Staging(root) as staging:
+        skipped = json.loads(path.read_text())
+        staging.remove()
+    return [str(line) for line in skipped]
+
+
+def differences(before: Any, now: Any, name: str = "") -> list[str]:
+    """One line per value that differs between two nested dictionaries: its dotted name, the old and the new value."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        lines = []
+        for key in sorted({*before, *now}):
+            inner = f"{name}: {key}" if name == "source" else f"{name}.{key}".removeprefix(".").removeprefix("recipe.")
+            lines += differences(before.get(key), now.get(key), inner)
+        return lines
+    if before == now:
+        return []
+    if name.startswith("source: "):
+        state = "is new" if before is None else "is gone" if now in (None, "absent") else "has changed"
+        return [f"{name} {state}"]
+    return [f"{name} was {before}, is {now}"]

@@ -1,0 +1,245 @@
+"""Video files: encode frames as the source was encoded, and cut an episode out of a shared file without loss."""
+
+import logging
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from fractions import Fraction
+from functools import cache
+from pathlib import Path
+
+import av
+import numpy as np
+from lerobot.configs import DepthEncoderConfig, RGBEncoderConfig
+from lerobot.datasets.depth_utils import quantize_depth
+from lerobot.datasets.pyav_utils import write_u16_plane
+from lerobot.datasets.video_utils import decode_video_frames, get_video_duration_in_s
+
+from lerobot_msdyn.core.errors import EpisodeError, OutputError
+from lerobot_msdyn.core.files import DISK_FAULTS
+from lerobot_msdyn.dataset.read import VIDEO_BACKEND, VIDEO_ERRORS
+from lerobot_msdyn.dataset.rows import TIMESTAMP_TOLERANCE_S
+
+logger = logging.getLogger(__name__)
+
+NVENC = {"h264": "h264_nvenc", "hevc": "hevc_nvenc"}  # LeRobot's encoders: on the processor, and on an NVIDIA GPU
+MAX_LEVEL_ERROR = 16  # of 255; coding changes a frame's mean brightness by less than 2, an empty frame by more
+
+
+def quiet_encoders() -> None:
+    """FFmpeg and the AV1 encoder write to stderr past every logger; what goes wrong is raised as well."""
+    av.logging.set_libav_level(av.logging.FATAL)
+    os.environ.setdefault("SVT_LOG", "1")
+
+
+def frame_rate(fps: int | float) -> Fraction:
+    """A rate as video files hold it, e.g. 30000/1001."""
+    return Fraction(fps).limit_denominator(1001)
+
+
+def encoder_of(feature: dict, key: str) -> RGBEncoderConfig | DepthEncoderConfig:
+    """LeRobot's encoder settings that a video feature was recorded with (codec, pixel format, quality).
+
+    Raises:
+        OutputError: this machine's FFmpeg cannot encode with them.
+    """
+    info = feature.get("info") or {}
+    kind = DepthEncoderConfig if info.get("is_depth_map") or info.get("video.is_depth_map") else RGBEncoderConfig
+    try:
+        return kind.from_video_info(info)
+    except (ValueError, TypeError) as error:
+        raise OutputError(f"{key}: cannot encode video as its source ({error})") from error
+
+
+def nvenc_of(encoder: RGBEncoderConfig | DepthEncoderConfig) -> RGBEncoderConfig | DepthEncoderConfig:
+    """The settings for NVENC, where LeRobot has them for the codec and the GPU can encode; else the given ones.
+
+    The codec stays what it was; LeRobot passes the quality on as NVENC's constant quantiser. Depth is never given to
+    it: NVENC has no format of one channel and 12 bits.
+    """
+    name = NVENC.get(encoder.vcodec)
+    if name is None or isinstance(encoder, DepthEncoderConfig) or not _can_encode(name):
+        return encoder
+    return replace(encoder, vcodec=name, preset=None)
+
+
+@cache
+def _can_encode(name: str) -> bool:
+    """Whether an encoder can be opened: FFmpeg lists those of GPUs on every machine."""
+    try:
+        codec = av.CodecContext.create(name, "w")
+        codec.width, codec.height, codec.pix_fmt, codec.time_base = 256, 256, "yuv420p", Fraction(1, 30)
+        codec.open()
+    except (av.FFmpegError, ValueError) as error:
+        logger.warning("%s cannot be used here (%s): videos are encoded on the processor", name, error)
+        return False
+    return True
+
+
+class VideoFile:
+    """An mp4 file that grows frame by frame, encoded as the source was."""
+
+    def __init__(self, path: Path, fps: int | float, encoder: RGBEncoderConfig | DepthEncoderConfig) -> None:
+        quiet_encoders()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._rate, self._encoder = frame_rate(fps), encoder
+        self._container = av.open(str(path), "w")
+        self._stream: av.VideoStream | None = None
+        self._count = 0
+
+    def __enter__(self) -> "VideoFile":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def add(self, picture: np.ndarray) -> None:
+        """Append colours uint8 [h,w,3], depth float32 [h,w] in m, or depth codes uint16 [h,w] that are quantised."""
+        if picture.ndim == 3:
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+        else:
+            frame = _depth_frame(picture, self._encoder)
+        if self._stream is None:
+            options = self._encoder.get_codec_options(as_strings=True)
+            self._stream = self._container.add_stream(self._encoder.vcodec, self._rate, options=options)
+            self._stream.pix_fmt = self._encoder.pix_fmt
+            self._stream.width, self._stream.height = frame.width, frame.height
+        frame.pts = self._count
+        frame.time_base = 1 / self._rate
+        self._container.mux(self._stream.encode(frame))
+        self._count += 1
+
+    def close(self) -> None:
+        """Write what the encoder still holds, and the file's index."""
+        if self._stream is not None:
+            self._container.mux(self._stream.encode())
+        self._container.close()
+
+
+def _depth_frame(depth: np.ndarray, encoder: RGBEncoderConfig | DepthEncoderConfig) -> av.VideoFrame:
+    codes = depth
+    if depth.dtype != np.uint16:
+        codes = quantize_depth(
+            depth,
+            depth_min=encoder.depth_min,
+            depth_max=encoder.depth_max,
+            shift=encoder.shift,
+            use_log=encoder.use_log,
+            video_backend=None,
+            input_unit="m",
+        )
+    frame = av.VideoFrame.from_ndarray(codes, format=encoder.pix_fmt)
+    write_u16_plane(frame.planes[0], codes)
+    return frame
+
+
+def cut_video(
+    source: Path,
+    start_s: float,
+    frames: int,
+    fps: int | float,
+    encoder: RGBEncoderConfig | DepthEncoderConfig,
+    path: Path,
+) -> None:
+    """Copy one episode out of a video file: packet by packet where it starts with a key frame, else encoded anew.
+
+    Raises:
+        EpisodeError: the file does not hold these frames.
+        OSError: the disk to write to is full.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        with av.open(str(source)) as container:
+            if container.streams.video[0].codec_context is None:  # copying such a stream would crash PyAV
+                raise ValueError("unknown codec")
+        if start_s == 0 and abs(get_video_duration_in_s(source) * fps - frames) < 0.5:
+            shutil.copyfile(source, path)
+        else:
+            _copy_packets(source, start_s, frames, fps, path)
+        if frame_times(path) != [i / frame_rate(fps) for i in range(frames)]:
+            _encode_anew(source, start_s, frames, fps, encoder, path)
+    except VIDEO_ERRORS as error:
+        if isinstance(error, OSError) and error.errno in DISK_FAULTS:
+            raise
+        raise EpisodeError(f"{source}: no {frames} frames from {start_s:.3f} s on ({type(error).__name__})") from error
+
+
+def frame_times(path: Path) -> list[Fraction]:
+    """Presentation times (s) of all frames of a video, in order, rounded to the nearest 1/1000 of a frame."""
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        rate = stream.average_rate or stream.base_rate
+        times = [packet.pts * stream.time_base for packet in container.demux(stream) if packet.pts is not None]
+    return sorted(Fraction(round(time * rate * 1000), 1000) / rate for time in times)
+
+
+def problem_of(
+    path: Path, frames: int, fps: int | float, size: tuple[int, int], levels: Sequence[float] | None = None
+) -> str | None:
+    """What is wrong with a video, found by decoding it all; None if nothing is.
+
+    Args:
+        path: the file.
+        frames: how many it should have, the i-th at i / fps seconds within LeRobot's tolerance.
+        fps: frames per second.
+        size: width and height, px.
+        levels: the mean brightness (0 to 255) that each frame was given.
+    """
+    count = 0
+    try:
+        with av.open(str(path)) as container:
+            for frame in container.decode(video=0):
+                if frame.pts is None or abs(float(frame.pts * frame.time_base) - count / fps) > TIMESTAMP_TOLERANCE_S:
+                    return f"frame {count} is not at {count / fps:.4f} s"
+                if (frame.width, frame.height) != size:
+                    return f"frame {count} is {frame.width}x{frame.height}; expected {size[0]}x{size[1]}"
+                if frame.is_corrupt:
+                    return f"frame {count} is damaged"
+                if levels is not None and count < frames:
+                    level = float(frame.to_ndarray(format="rgb24").mean())
+                    if abs(level - levels[count]) > MAX_LEVEL_ERROR:
+                        return f"frame {count} has brightness {level:.0f}; {levels[count]:.0f} was drawn"
+                count += 1
+    except VIDEO_ERRORS as error:
+        return f"it cannot be decoded after {count} frames ({type(error).__name__})"
+    return None if count == frames else f"it has {count} frames; expected {frames}"
+
+
+def _copy_packets(source: Path, start_s: float, frames: int, fps: int | float, path: Path) -> None:
+    half = 0.5 / fps
+    with av.open(str(source)) as reader, av.open(str(path), "w", options={"movflags": "faststart"}) as writer:
+        stream = reader.streams.video[0]
+        copy = writer.add_stream_from_template(template=stream, opaque=True)
+        copy.time_base = stream.time_base
+        reader.seek(round(start_s / stream.time_base), stream=stream, backward=True, any_frame=False)
+        first = None
+        for packet in reader.demux(stream):
+            if packet.dts is None or packet.pts is None:
+                continue
+            time = float(packet.pts * stream.time_base) - start_s
+            if time < -half or time > frames / fps - half:
+                continue
+            first = packet.pts if first is None else first
+            packet.pts -= first
+            packet.dts -= first
+            packet.stream = copy
+            writer.mux(packet)
+
+
+def _encode_anew(
+    source: Path,
+    start_s: float,
+    frames: int,
+    fps: int | float,
+    encoder: RGBEncoderConfig | DepthEncoderConfig,
+    path: Path,
+) -> None:
+    is_depth = isinstance(encoder, DepthEncoderConfig)
+    times = [start_s + i / fps for i in range(frames)]
+    pictures = decode_video_frames(
+        source, times, TIMESTAMP_TOLERANCE_S, VIDEO_BACKEND, return_uint8=True, is_depth=is_depth
+    )
+    with VideoFile(path, fps, encoder) as file:
+        for picture in pictures:
+            file.add(picture[0].numpy().astype(np.uint16) if is_depth else picture.permute(1, 2, 0).numpy())

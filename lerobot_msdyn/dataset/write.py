@@ -1,0 +1,370 @@
+"""Write a new LeRobot dataset: the source's rows bit for bit, its other cameras copied, new pictures encoded alike.
+
+Everything is prepared in a hidden folder beside the output (see `staging`), which appears by one rename when it is
+complete.
+"""
+
+import copy
+import os
+import shutil
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.datasets.compute_stats import compute_episode_stats
+from lerobot.datasets.io_utils import write_info, write_stats, write_tasks
+from lerobot.datasets.utils import update_chunk_file_indices
+from lerobot.datasets.video_utils import concatenate_video_files, get_video_duration_in_s
+
+from lerobot_msdyn.core.errors import OutputError
+from lerobot_msdyn.core.files import temporary_files_in, writing
+from lerobot_msdyn.dataset.card import licence_of, write_card
+from lerobot_msdyn.dataset.checks import PICTURE_DTYPES, TEXT_DTYPES
+from lerobot_msdyn.dataset.copy_source import stage_copies
+from lerobot_msdyn.dataset.encode import StagedPictures, Stats, stage_pictures
+from lerobot_msdyn.dataset.provenance import Provenance, write_provenance, write_unseen
+from lerobot_msdyn.dataset.rows import TIMESTAMP_TOLERANCE_S, read_rows, values_of
+from lerobot_msdyn.dataset.staging import FINISHED, SCENE, Kept, Staging
+from lerobot_msdyn.dataset.video import frame_times
+from lerobot_msdyn.scene import store as saved
+
+MEGABYTE = 1024**2
+
+
+@dataclass(frozen=True)
+class NewEpisode:
+    """One episode of the output: a source episode with some cameras' pictures replaced."""
+
+    source_index: int
+    provenance: Provenance
+    pictures: StagedPictures = field(default_factory=StagedPictures)  # none for a copy of the source's episode
+    masks: Mapping[str, np.ndarray] = field(default_factory=dict)  # of what was never seen, see `write_unseen`
+    dropped: str = ""  # why there is no such episode in the end: the gate's reason
+    seconds: Mapping[str, float] = field(default_factory=dict)  # what took how long, for the report
+
+
+class OutputDataset:
+    """A dataset in the making. Use as a context; what is finished is kept for the next run, until the dataset is."""
+
+    def __init__(
+        self,
+        source: LeRobotDatasetMetadata,
+        repo_id: str,
+        root: Path,
+        staging: Staging | None = None,
+        *,
+        nvenc: bool = False,
+    ) -> None:
+        """Prepare the work folder.
+
+        Args:
+            source: the dataset whose episodes are re-rendered.
+            repo_id: the new dataset's name.
+            root: its place.
+            staging: a work folder that may hold what an earlier run finished; default: an empty one.
+            nvenc: whether a GPU encodes the new videos where it can.
+
+        Raises:
+            OutputError: the place is taken, lies inside the source, is being written by another run, or cannot be.
+        """
+        check_place(source.root, root)
+        self.source, self.repo_id, self.root, self.nvenc = source, repo_id, root, nvenc
+        self._resumable = staging is not None
+        self.staging = staging or Staging(root)
+        if staging is None:
+            self.staging.clear()
+        self.scenes = self.staging.folder / "scenes"
+
+    def __enter__(self) -> "OutputDataset":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if not self._resumable:
+            self.staging.remove()
+        self.staging.close()
+
+    def episode(self, index: int) -> Kept:
+        """What is kept of one source episode: `keep` computes a value once, whatever number of runs it takes."""
+        return self.staging.episode(index)
+
+    def stage(
+        self, index: int, variant: int, frames: Iterable[Mapping[str, np.ndarray]], provenance: Provenance
+    ) -> NewEpisode:
+        """Encode the new pictures of one episode as they are drawn (see `stage_pictures`)."""
+        folder = self.episode(index).folder / f"variant_{variant:02d}"
+        length = int(self.source.episodes[index]["length"])
+        pictures = stage_pictures(self.source, folder, frames, length, nvenc=self.nvenc)
+        return NewEpisode(index, provenance, pictures)
+
+    def is_finished(self, index: int) -> bool:
+        """Whether all new episodes of one source episode are made."""
+        return self.episode(index).has(FINISHED)
+
+    def finish_episode(self, index: int, make: Callable[[], list[NewEpisode]]) -> list[NewEpisode]:
+        """All new episodes of one source episode, made once; what the source has to offer is copied and checked first.
+
+        Raises:
+            EpisodeError: a file of the episode is absent or damaged.
+            OutputError: the disk is full.
+        """
+        kept = self.episode(index)
+
+        def complete() -> list[NewEpisode]:
+            self.copies(index)
+            return make()
+
+        new: list[NewEpisode] = kept.keep(FINISHED, complete)
+        kept.forget(SCENE)
+        return new
+
+    def copies(self, index: int) -> StagedPictures:
+        """The source's pictures of one episode, cut out and checked."""
+        kept = self.episode(index)
+
+        def make() -> StagedPictures:
+            with writing(kept.folder):
+                return stage_copies(self.source, index, self.source.camera_keys, kept.folder / "copied")
+
+        found: StagedPictures = kept.keep("copied", make)
+        return found
+
+    def finish(
+        self,
+        episodes: list[NewEpisode],
+        recipe_yaml: str,
+        skipped: Sequence[str] = (),
+        report: Callable[[Path], object] = lambda folder: None,
+    ) -> None:
+        """Put the dataset together, read it again, and move it to its place.
+
+        Args:
+            episodes: what it consists of, in order.
+            recipe_yaml: the settings that it was made with.
+            skipped: one line per source or new episode that is not in it.
+            report: called with the folder of the complete dataset, before it is moved.
+
+        Raises:
+            EpisodeError: a file of the source cannot be copied.
+            OutputError: the place was taken meanwhile, the disk is full, or what was written cannot be read.
+        """
+        folder = self.staging.folder / "dataset"
+        with writing(folder), temporary_files_in(self.staging.folder):
+            shutil.rmtree(folder, ignore_errors=True)
+            _Assembly(self.source, self.repo_id, folder, self.copies).build(episodes)
+            write_provenance(folder, [episode.provenance for episode in episodes], recipe_yaml)
+            for number, episode in enumerate(episodes):
+                if episode.masks:
+                    write_unseen(folder, number, episode.masks)
+            if self.scenes.is_dir():
+                shutil.copytree(self.scenes, folder / saved.FOLDER, copy_function=os.link)
+            write_card(folder, self.repo_id, licence_of(self.source.root))
+            report(folder)
+            if self.root.exists():
+                raise OutputError(f"{self.root} appeared while the dataset was made; it was left as it is")
+            self.staging.publish(folder, self.root, skipped)
+
+
+def check_place(source_root: Path, root: Path) -> None:
+    """Whether a dataset can be written to `root`.
+
+    Raises:
+        OutputError: it exists already, or lies inside the source.
+    """
+    if root.resolve().is_relative_to(source_root.resolve()):
+        raise OutputError(
+            f"{root} lies inside the source {source_root}, which is never written to; choose another --new_root"
+        )
+    if root.exists():
+        raise OutputError(f"{root} exists already; remove it or choose another --new_repo_id or --new_root")
+
+
+class _Files:
+    """Chunk and file indices of a growing series of files of bounded size."""
+
+    def __init__(self, chunks_size: int) -> None:
+        self._chunks_size = chunks_size
+        self._next = (0, 0)
+
+    def take(self) -> tuple[int, int]:
+        taken = self._next
+        self._next = update_chunk_file_indices(*taken, self._chunks_size)
+        return taken
+
+
+class _RowFiles:
+    """The growing series of parquet files, one row group per episode, as LeRobot writes them."""
+
+    def __init__(self, meta: LeRobotDatasetMetadata, folder: Path) -> None:
+        self._meta, self._folder = meta, folder
+        self._files = _Files(meta.chunks_size)
+        self._writer: pq.ParquetWriter | None = None
+        self._path, self._place = folder, (0, 0)
+
+    def __enter__(self) -> "_RowFiles":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._writer is not None:
+            self._writer.close()
+
+    def add(self, rows: pa.Table) -> tuple[int, int]:
+        """Append an episode; returns the chunk and file index of where it went."""
+        if self._writer is not None and self._path.stat().st_size > self._meta.data_files_size_in_mb * MEGABYTE:
+            self._writer.close()
+            self._writer = None
+        if self._writer is None:
+            self._place = self._files.take()
+            chunk, file = self._place
+            self._path = self._folder / self._meta.data_path.format(chunk_index=chunk, file_index=file)
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._writer = pq.ParquetWriter(self._path, rows.schema, compression="snappy", use_dictionary=True)
+        self._writer.write_table(rows, row_group_size=rows.num_rows)
+        return self._place
+
+
+class _Assembly:
+    """Builds the folder of a dataset from staged episodes."""
+
+    def __init__(
+        self,
+        source: LeRobotDatasetMetadata,
+        repo_id: str,
+        folder: Path,
+        copies: Callable[[int], StagedPictures],
+    ) -> None:
+        self.source = source
+        self.copies = copies
+        self.folder = folder
+        self.meta = LeRobotDatasetMetadata.create(
+            repo_id=repo_id,
+            fps=source.fps,
+            features=source.features,
+            robot_type=source.robot_type,
+            root=folder,
+            use_videos=bool(source.video_keys),
+            chunks_size=source.chunks_size,
+            data_files_size_in_mb=source.data_files_size_in_mb,
+            video_files_size_in_mb=source.video_files_size_in_mb,
+        )
+        self.meta.info.features = copy.deepcopy(source.features)
+        self.meta.info.tools = copy.deepcopy(source.info.tools)
+        self.meta.tasks = source.tasks.copy()
+        write_info(self.meta.info, folder)
+        write_tasks(self.meta.tasks, folder)
+
+    def build(self, episodes: list[NewEpisode]) -> None:
+        places: list[dict[str, Any]] = [{} for _ in episodes]
+        for key in self.source.video_keys:
+            self._place_videos(key, episodes, places)
+        self._place_rows(episodes, places)
+        self.meta.finalize()
+        # LeRobot lists features in the order of a set, which is another in every process.
+        write_stats(dict(sorted((self.meta.stats or {}).items())), self.folder)
+
+    def _place_videos(self, key: str, episodes: list[NewEpisode], places: list[dict[str, Any]]) -> None:
+        """Concatenate one camera's videos into files of bounded size; copies and renders never share a file."""
+        files = _Files(self.meta.chunks_size)
+        for rendered in (False, True):
+            group: list[tuple[int, Path]] = []
+            size = 0
+            for i, episode in enumerate(episodes):
+                if (key in episode.pictures.videos) != rendered:
+                    continue
+                pictures = episode.pictures if rendered else self.copies(episode.source_index)
+                path = pictures.videos[key]
+                if group and size + path.stat().st_size > self.meta.video_files_size_in_mb * MEGABYTE:
+                    self._write_video_file(key, group, files.take(), places)
+                    group, size = [], 0
+                group.append((i, path))
+                size += path.stat().st_size
+            if group:
+                self._write_video_file(key, group, files.take(), places)
+
+    def _write_video_file(
+        self, key: str, group: list[tuple[int, Path]], place: tuple[int, int], places: list[dict[str, Any]]
+    ) -> None:
+        chunk, file = place
+        path = self.folder / str(self.meta.video_path).format(video_key=key, chunk_index=chunk, file_index=file)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if len(group) == 1:
+            shutil.copyfile(group[0][1], path)
+        else:
+            concatenate_video_files([part for _, part in group], path)
+        start = 0.0
+        for i, part in group:
+            end = start + get_video_duration_in_s(part)
+            places[i] |= {
+                f"videos/{key}/chunk_index": chunk,
+                f"videos/{key}/file_index": file,
+                f"videos/{key}/from_timestamp": start,
+                f"videos/{key}/to_timestamp": end,
+            }
+            start = end
+        _check_times(path, sum(len(frame_times(part)) for _, part in group), self.meta.fps)
+
+    def _place_rows(self, episodes: list[NewEpisode], places: list[dict[str, Any]]) -> None:
+        start = 0
+        with _RowFiles(self.meta, self.folder) as files:
+            for i, episode in enumerate(episodes):
+                rows = self._new_rows(episode, i, start)
+                chunk, file = files.add(rows)
+                stats = self.copies(episode.source_index).stats | self._row_stats(rows) | episode.pictures.stats
+                self.meta.save_episode(
+                    i,
+                    rows.num_rows,
+                    list(self.source.episodes[episode.source_index]["tasks"]),
+                    {key: stats[key] for key in self.source.features if key in stats},
+                    {"data/chunk_index": chunk, "data/file_index": file} | places[i],
+                )
+                start += rows.num_rows
+
+    def _new_rows(self, episode: NewEpisode, index: int, start: int) -> pa.Table:
+        """The source's rows with new indices and, for re-rendered image features, new pictures."""
+        rows = read_rows(self.source, episode.source_index)
+        new_columns: dict[str, Any] = {
+            "episode_index": [index] * rows.num_rows,
+            "index": range(start, start + rows.num_rows),
+        }
+        for key, folder in episode.pictures.images.items():
+            new_columns[key] = [{"bytes": path.read_bytes(), "path": path.name} for path in sorted(folder.iterdir())]
+        for key, values in new_columns.items():
+            position = rows.column_names.index(key)
+            rows = rows.set_column(
+                position, rows.schema.field(position), [pa.array(values, rows.schema.field(key).type)]
+            )
+        return rows
+
+    def _row_stats(self, rows: pa.Table) -> Stats:
+        """Statistics of the numeric columns, computed as LeRobot does when it records."""
+        columns = {
+            key: values_of(rows, key, feature)
+            for key, feature in self.source.features.items()
+            if feature["dtype"] not in PICTURE_DTYPES + TEXT_DTYPES
+        }
+        # LeRobot's are per last axis where there are several, except for a single row: made alike, so that they add up.
+        nested = [key for key, values in columns.items() if values.ndim > 2]
+        columns |= {key: columns[key].reshape(-1, columns[key].shape[-1]) for key in nested}
+        stats: Stats = compute_episode_stats(columns, self.source.features)
+        for key in nested:
+            stats[key]["count"] = np.array([rows.num_rows])
+        return stats
+
+
+def _check_times(path: Path, frames: int, fps: int | float) -> None:
+    """Whether the frames of a file that was put together follow each other evenly.
+
+    Raises:
+        OutputError: they do not.
+    """
+    times = frame_times(path)
+    late = max((abs(float(time) - i / fps) for i, time in enumerate(times)), default=0.0)
+    if len(times) != frames or late > TIMESTAMP_TOLERANCE_S:
+        raise OutputError(
+            f"{path} holds {len(times)} frames, up to {late:.4f} s from their times; expected {frames} within "
+            f"{TIMESTAMP_TOLERANCE_S} s"
+        )

@@ -1,0 +1,104 @@
+"""Novel views of DyCheck's iPhone sequences, by either of the two protocols; their numbers must not share a table.
+
+`dycheck`: 2x pictures, the sequence's own cameras and masks (Gao et al. 2022). `som`: 1x pictures, with the cameras
+and masks of Shape of Motion's package (Wang et al. 2025), which later papers follow.
+"""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from numpy import ndarray
+
+from lerobot_msdyn.core.config import DycheckConfig
+from lerobot_msdyn.evaluate.dycheck.iphone import IphoneSequence, read_sequence
+from lerobot_msdyn.evaluate.dycheck.iphone_priors import read_priors
+from lerobot_msdyn.evaluate.metrics import masked_psnr_db, partial_ssim
+from lerobot_msdyn.evaluate.perceptual import SpatialNetwork, lpips_network, masked_lpips, without_lpips
+from lerobot_msdyn.evaluate.scores import Evaluated, Scores, mean_scores, score_table
+from lerobot_msdyn.evaluate.timing import timed, timed_reconstruction
+from lerobot_msdyn.priors.exchange import write_exchange
+from lerobot_msdyn.views.pictures import Reconstruction, new_pictures
+
+PRIORS_FILE = "priors.npz"
+
+
+def evaluate_dycheck(config: DycheckConfig) -> Evaluated:
+    """Fit camera 0 of a sequence, draw all validation views to `out`, and score them, all by one protocol.
+
+    Beside them, scores of the recorded picture of the same time, shown as it is.
+
+    Raises:
+        DatasetError: a file of the sequence is absent or not as expected.
+        PriorError: a prior cannot be had.
+    """
+    seconds: dict[str, float] = {}
+    with timed(seconds, "read"):
+        sequence = read_sequence(config.root, config.protocol)
+        _use_priors(config, sequence)
+    scene = timed_reconstruction(seconds, sequence.view, config)
+    with timed(seconds, "render"):
+        drawn = draw_validation(scene, sequence, config.out / "rgb")
+    with timed(seconds, "score"):
+        missing = without_lpips()
+        network = None if missing else lpips_network()
+        images = {name: _score(sequence, name, picture, network) for name, picture in drawn.items()}
+        shown = sequence.view.rgb.numpy()
+        unchanged = [
+            _score(sequence, name, shown[frame], network)
+            for name, frame in zip(sequence.validation, sequence.frames, strict=True)
+        ]
+    empty = sum(math.isnan(scores["mpsnr"]) for scores in images.values())
+    notices = [missing, f"{empty} of {len(images)} masks are empty: without mPSNR" if empty else ""]
+    rows = {"this fit": mean_scores([*images.values()]), "recorded picture of that time": mean_scores(unchanged)}
+    content: dict[str, Any] = {
+        "sequence": config.root.name,
+        "protocol": config.protocol,
+        "mean": rows,
+        "images": images,
+    }
+    content |= {"seconds": seconds, "pictures": len(images), "notices": [notice for notice in notices if notice]}
+    table = score_table(rows, f"{config.root.name}, protocol {config.protocol}")
+    return Evaluated(content, table, config.out).written()
+
+
+def draw_validation(scene: Reconstruction, sequence: IphoneSequence, out: Path) -> dict[str, UInt8[ndarray, "h w 3"]]:
+    """The scene through the validation cameras, by picture; written to `out` as <id>.png."""
+    out.mkdir(parents=True, exist_ok=True)
+    drawn = {}
+    cameras = np.array([name.split("_")[0] for name in sequence.validation])
+    for camera in dict.fromkeys(cameras.tolist()):  # each stands still
+        mine = np.flatnonzero(cameras == camera)
+        frames = torch.tensor([sequence.frames[i] for i in mine])
+        pictures = new_pictures(scene, sequence.cameras.select(mine.tolist()), frames)
+        for i, picture in zip(mine.tolist(), pictures, strict=True):
+            drawn[sequence.validation[i]] = picture.rgb
+            cv2.imwrite(str(out / f"{sequence.validation[i]}.png"), picture.rgb[..., ::-1])
+    return drawn
+
+
+def _use_priors(config: DycheckConfig, sequence: IphoneSequence) -> None:
+    """Takes from Shape of Motion's package what the recipe leaves to be chosen; it is kept in OUT/priors.npz."""
+    if sequence.protocol != "som":
+        return
+    found = read_priors(sequence, config.fit.max_width)
+    wanted = {name: getattr(found, name) is not None for name in ("masks", "depth", "tracks")}
+    path = config.out / PRIORS_FILE
+    write_exchange(path, found)
+    for name, there in wanted.items():
+        if there and getattr(config.priors, name) == "auto":
+            setattr(config.priors, name, str(path))
+
+
+def _score(
+    sequence: IphoneSequence, name: str, picture: UInt8[ndarray, "h w 3"], network: SpatialNetwork | None
+) -> Scores:
+    true, mask = sequence.true_picture(name), sequence.covisible(name)
+    scores = {"mpsnr": masked_psnr_db(picture, true, mask), "mssim": partial_ssim(picture, true, mask)}
+    if mask.sum() == 0:
+        scores["mpsnr"] = math.nan
+    return scores if network is None else scores | {"mlpips": masked_lpips(picture, true, mask, network)}

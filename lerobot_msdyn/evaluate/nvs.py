@@ -1,0 +1,149 @@
+"""Held-out views of one episode in the folder of docs/evaluate.md: fitted, drawn, and scored where the truth is there.
+
+The fit reads nothing of `gt/` but the recorded camera; the truth is read after the views are drawn.
+"""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from numpy import ndarray
+
+from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.config import EvaluateConfig
+from lerobot_msdyn.core.errors import DatasetError
+from lerobot_msdyn.dataset.read import View, open_source, read_episode, select_cameras
+from lerobot_msdyn.evaluate.perceptual import without_flip
+from lerobot_msdyn.evaluate.scores import Evaluated, Scores, TrueViews, mean_scores, score_table, score_views
+from lerobot_msdyn.evaluate.timing import timed, timed_reconstruction
+from lerobot_msdyn.views.pictures import Reconstruction, new_pictures
+
+
+def evaluate_nvs(config: EvaluateConfig) -> Evaluated:
+    """Fit the episode and draw its held-out cameras to `out`; scores per camera and their mean, written there too.
+
+    Raises:
+        DatasetError: a file of the folder is absent or not as documented.
+    """
+    seconds: dict[str, float] = {}
+    with timed(seconds, "read"):
+        view = read_view(config)
+    config.priors.depth = {"recorded": "recorded", "none": "plane"}.get(config.depth, config.depth)
+    scene = timed_reconstruction(seconds, view, config)
+    cameras: dict[str, Scores] = {}
+    pictures = 0
+    for path in sorted((config.scene_folder / "gt" / "heldout").glob("*.npz")):
+        with timed(seconds, "render"):
+            drawn = _draw(scene, path, config.out / path.stem)
+        pictures += len(drawn)
+        with timed(seconds, "score"):
+            truth = read_truth(config.scene_folder, path.stem)
+            if truth is not None:
+                cameras[path.stem] = score_views(drawn, truth)
+    mean = mean_scores([*cameras.values()])
+    notices = [without_flip()] if cameras else ["no scores: no true views with covis in gt/heldout"]
+    content: dict[str, Any] = {
+        "scene": config.scene_folder.name,
+        "cameras": cameras,
+        "mean": mean,
+        "pictures": pictures,
+    }
+    content |= {"seconds": seconds, "notices": [notice for notice in notices if notice]}
+    return Evaluated(content, score_table(cameras | {"mean": mean}) if cameras else "", config.out).written()
+
+
+def read_view(config: EvaluateConfig) -> View:
+    """The recorded video with its true camera; with recorded depth where that is asked for."""
+    folder, recorded = config.scene_folder, config.depth == "recorded"
+    train = _arrays(folder / "gt" / "train.npz", ("K", "c2w"))
+    source = open_source(f"local/{folder.name}", folder / ("dataset_depth" if recorded else "dataset"))
+    key = select_cameras(source, config.cameras)[0]
+    view = read_episode(source, 0, [key], config.camera, recorded_depth=recorded).views[key]
+    height, width = view.rgb.shape[1:3]
+    return replace(view, camera=_track(train, width, height))
+
+
+def read_truth(folder: Path, camera: str) -> TrueViews | None:
+    """What a held-out camera truly saw; None where the pictures or `covis` are not there.
+
+    Raises:
+        DatasetError: a file cannot be read, or its parts do not belong together.
+    """
+    path = folder / "gt" / "heldout" / f"{camera}.npz"
+    arrays = _arrays(path, ("frame",), ("covis", "seg"))
+    rgb = _true_pictures(path, arrays["frame"].tolist()) if "covis" in arrays else None
+    if rgb is None:
+        return None
+    images = {name: np.moveaxis(arrays[name], -1, 0) for name in ("covis", "seg") if name in arrays}
+    for name, image in images.items():
+        if image.shape != rgb.shape[:3]:
+            raise DatasetError(
+                f"{path}: {name} is {list(image.shape)} with its last axis first; "
+                f"expected {list(rgb.shape[:3])}, as the true pictures are"
+            )
+    moving = None
+    meta = folder / "gt" / "meta.json"
+    if "seg" in images and meta.is_file():
+        moving = np.isin(images["seg"], _moving_bodies(meta))
+    return TrueViews(rgb, images["covis"].astype(np.uint8), moving)
+
+
+def _draw(scene: Reconstruction, path: Path, out: Path) -> UInt8[ndarray, "n h w 3"]:
+    """The views of one held-out camera, written to `out` as well."""
+    heldout = _arrays(path, ("frame", "c2w", "K"))
+    frames = torch.as_tensor(heldout["frame"]).long()
+    out.mkdir(parents=True, exist_ok=True)
+    camera = _track(heldout, scene.camera.width, scene.camera.height)
+    drawn = [picture.rgb for picture in new_pictures(scene, camera, frames)]
+    for frame, picture in zip(frames.tolist(), drawn, strict=True):
+        cv2.imwrite(str(out / f"rgb_{frame:04d}.png"), picture[..., ::-1])
+    return np.stack(drawn)
+
+
+def _track(arrays: dict[str, ndarray], width: int, height: int) -> CameraTrack:
+    poses = torch.as_tensor(arrays["c2w"]).float()
+    intrinsics = torch.as_tensor(arrays["K"]).float().expand(len(poses), 3, 3).contiguous()
+    return CameraTrack(intrinsics, poses, width, height)
+
+
+def _true_pictures(path: Path, frames: list[int]) -> UInt8[ndarray, "n h w 3"] | None:
+    """From the lossless video beside the .npz file, else the folder of pictures; None if there is neither."""
+    video, folder = path.with_suffix(".mkv"), path.with_suffix("")
+    if video.is_file():
+        try:
+            with av.open(str(video)) as container:
+                found = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+        except (av.FFmpegError, OSError) as error:
+            raise DatasetError(f"{video}: cannot be decoded ({error})") from error
+    elif folder.is_dir():
+        files = [folder / f"rgb_{frame:04d}.png" for frame in frames]
+        found = [picture for file in files if (picture := cv2.imread(str(file), cv2.IMREAD_COLOR_RGB)) is not None]
+    else:
+        return None
+    if len(found) != len(frames):
+        raise DatasetError(f"{path}: has {len(frames)} frames, the true pictures beside it are {len(found)}")
+    return np.stack(found)
+
+
+def _moving_bodies(meta: Path) -> list[int]:
+    try:
+        return [int(body) for body in json.loads(meta.read_text())["dynamic_ids"]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DatasetError(f"{meta}: expected dynamic_ids, a list of body ids ({error})") from error
+
+
+def _arrays(path: Path, names: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Some arrays of an npz file; the others are not read."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in names + tuple(name for name in optional if name in file)}
+    except (OSError, ValueError, KeyError) as error:
+        raise DatasetError(
+            f"{path}: expected an npz file with {', '.join(names)} ({error}); see docs/evaluate.md"
+        ) from error

@@ -1,1 +1,0 @@
-"""How far pictures are from the true ones, and the protocols by which reconstructions are compared."""

@@ -1,0 +1,79 @@
+"""What moves before a camera that moves itself: what is left when the neighbouring frames are laid over a frame."""
+
+import itertools
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+from numpy import ndarray
+
+from lerobot_msdyn.priors.masks.change import Reference, along_edges
+
+_OFFSETS = (-12, -8, -4, 4, 8, 12)  # frames that are laid over a frame; together they show its background
+_MIN_SEEN = 3  # of them, without which a pixel is not judged
+_CORNERS = 600
+_MIN_CORNERS = 12  # that must agree on a homography
+_AGREE_PX = 1.5
+_NOISE_FLOOR = 2.0  # CIE Lab units: warped pictures are a little blurred
+
+
+def residual_odds(frames: UInt8[ndarray, "t h w 3"]) -> Float32[ndarray, "t h w"]:
+    """Log-odds that a pixel differs from the background that its neighbouring frames show (0 = not known).
+
+    Frames are laid over each other by a homography of the corners that agree (RANSAC): exact for a camera that turns,
+    and for what is flat or far; near things before a far ground keep a rim of parallax.
+    """
+    grey = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in frames]
+    links = [_homography(a, b) for a, b in itertools.pairwise(grey)]
+    out = np.zeros(frames.shape[:3], np.float32)
+    for t in range(len(frames)):
+        others = [t + offset for offset in _OFFSETS if 0 <= t + offset < len(frames)]
+        laid = [_laid_over(frames[s], _chained(links, t, s)) for s in others]
+        pictures = [picture for picture in laid if picture is not None]
+        if len(pictures) < _MIN_SEEN:
+            continue
+        stack: np.ma.MaskedArray = np.ma.masked_array(
+            np.stack([picture for picture, _ in pictures]),
+            np.stack([np.broadcast_to(~seen[..., None], picture.shape) for picture, seen in pictures]),
+        )
+        background = np.ma.median(stack, axis=0).filled(0).astype(np.uint8)
+        known = (~stack.mask[..., 0]).sum(0) >= _MIN_SEEN
+        odds = Reference(background, np.full(known.shape, _NOISE_FLOOR, np.float32)).change(frames[t])
+        out[t] = np.where(known, along_edges(odds, frames[t]), 0)
+    return out
+
+
+def _homography(target: UInt8[ndarray, "h w"], source: UInt8[ndarray, "h w"]) -> Float64[ndarray, "3 3"] | None:
+    """Pixels of the target -> pixels of the source, its neighbour, or None if too few corners agree."""
+    corners = cv2.goodFeaturesToTrack(target, _CORNERS, 0.01, 7)
+    if corners is None or len(corners) < _MIN_CORNERS:
+        return None
+    found, status, _ = cv2.calcOpticalFlowPyrLK(target, source, corners, None, winSize=(21, 21), maxLevel=4)
+    good = status[:, 0] > 0
+    if good.sum() < _MIN_CORNERS:
+        return None
+    homography, agree = cv2.findHomography(corners[good], found[good], cv2.RANSAC, _AGREE_PX)
+    return homography if homography is not None and agree.sum() >= _MIN_CORNERS else None
+
+
+def _chained(links: list[Float64[ndarray, "3 3"] | None], target: int, source: int) -> Float64[ndarray, "3 3"] | None:
+    """Pixels of the target -> pixels of the source, through the frames between them; None if a link is missing."""
+    chain = np.eye(3)
+    for link in links[min(target, source) : max(target, source)]:
+        if link is None:
+            return None
+        chain = link @ chain
+    return chain if target < source else np.linalg.inv(chain)
+
+
+def _laid_over(
+    frame: UInt8[ndarray, "h w 3"], homography: Float64[ndarray, "3 3"] | None
+) -> tuple[ndarray, ndarray] | None:
+    """A frame as seen from another, and where it shows anything."""
+    if homography is None:
+        return None
+    size = (frame.shape[1], frame.shape[0])
+    picture = cv2.warpPerspective(frame, homography, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+    inside = np.ones(frame.shape[:2], np.uint8)
+    seen = cv2.warpPerspective(inside, homography, size, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)
+    return picture, seen > 0

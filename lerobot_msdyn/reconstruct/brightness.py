@@ -1,0 +1,138 @@
+"""How brightness changes over time: of the static set from the video alone, of the moving set against a drawn scene."""
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, UInt8
+from numpy import ndarray
+from torch import Tensor
+
+from lerobot_msdyn.core.geometry import project, transform_points
+from lerobot_msdyn.core.serialise import to_device
+from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.priors import Priors
+from lerobot_msdyn.scene.draw import draw, landed
+from lerobot_msdyn.scene.gaussians import DynamicScene, Gaussians
+from lerobot_msdyn.scene.shading import Shading, encode_gain, no_shading
+
+BLUR_PX = 1.5  # noise, and texture that does not fit, are averaged over about this
+FIELD_STEP = 2  # px of the fitted image per pixel of the field of gains
+MASK_MARGIN_PX = 2  # colours of what moves bleed this far
+FLOOR = 4.0  # grey levels added to both sides of a ratio: noise in the dark is no gain
+SURE_WEIGHT = 0.5  # share of the blur's window that must be known
+MOVING_STEP = 2  # the moving set is measured at every second frame, and over three of these
+
+
+def static_shading(
+    static: Gaussians, moving: int, view: View, priors: Priors, empty: UInt8[Tensor, "h w 3"]
+) -> Shading:
+    """Shading of the static set of a fixed camera; that of the `moving` others is one.
+
+    The gain of a pixel is the ratio of the frame to the `empty` scene, both without what moves, blurred over pixels and
+    averaged over three frames. Behind what moves it is that of its surroundings.
+    """
+    frames = len(view.rgb)
+    if not view.camera.is_static:
+        return no_shading(len(static), moving, frames)
+    still = _grey(empty.numpy())
+    sums = [_field_sums(view, priors, still, t) for t in range(min(2, frames))]
+    fields = []
+    for t in range(frames):
+        fields.append(encode_gain(torch.from_numpy(_ratio(np.sum(sums, axis=0)))))
+        if t + 2 < frames:
+            sums.append(_field_sums(view, priors, still, t + 2))
+        if t > 0:
+            del sums[0]
+    camera = view.camera.select([0])
+    xy, _ = project(transform_points(camera.camera_from_world[0], static.means), camera.intrinsics[0])
+    places = xy / torch.tensor([camera.width, camera.height]) * 2 - 1
+    return Shading(torch.stack(fields), places, no_shading(0, moving, frames).moving)
+
+
+def _field_sums(view: View, priors: Priors, empty: Float32[ndarray, "h w"], frame: int) -> Float32[ndarray, "a b 3"]:
+    """Blurred brightness of the frame and of the empty scene where nothing moves, and the share of such pixels."""
+    window = np.ones((2 * MASK_MARGIN_PX + 1,) * 2, np.uint8)
+    still = cv2.dilate((priors.instances[frame] > 0).numpy().astype(np.uint8), window) == 0
+    height, width = still.shape
+    sums = _blurred_sums(_grey(view.rgb[frame].numpy()), empty, still)
+    size = (-(-width // FIELD_STEP), -(-height // FIELD_STEP))
+    return cv2.resize(sums, size, interpolation=cv2.INTER_AREA)
+
+
+def _blurred_sums(
+    numerator: Float32[ndarray, "h w"], denominator: Float32[ndarray, "h w"], usable: Bool[ndarray, "h w"]
+) -> Float32[ndarray, "h w 3"]:
+    weight = usable.astype(np.float32)
+    stacked = np.stack(((numerator + FLOOR) * weight, (denominator + FLOOR) * weight, weight), axis=-1)
+    return cv2.GaussianBlur(stacked, (0, 0), BLUR_PX)
+
+
+def _ratio(sums: Float32[ndarray, "a b 3"]) -> Float32[ndarray, "a b"]:
+    """Ratio of the first two sums; where the third, their weight, is small, that of ever larger surroundings."""
+    pyramid = [sums]
+    while min(pyramid[-1].shape[:2]) > 2:
+        height, width = pyramid[-1].shape[:2]
+        pyramid.append(cv2.resize(pyramid[-1], (-(-width // 2), -(-height // 2)), interpolation=cv2.INTER_AREA))
+    log = np.zeros(pyramid[-1].shape[:2], np.float32)
+    for level in reversed(pyramid):
+        log = cv2.resize(log, level.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+        known = np.clip(level[..., 2] / SURE_WEIGHT, 0, 1)
+        own = np.log((level[..., 0] + 1e-6) / (level[..., 1] + 1e-6))
+        log += known * (own - log)
+    return np.exp(log)
+
+
+def _grey(rgb: UInt8[ndarray, "h w 3"] | Float32[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:
+    return rgb.astype(np.float32).mean(-1)
+
+
+@torch.no_grad()
+def moving_gain(scene: DynamicScene, view: View, priors: Priors, backend: str = "auto") -> UInt8[Tensor, "t m"]:
+    """Coded gains by which every moving Gaussian differs from its colour over time, on the host.
+
+    At every second frame, each Gaussian that is seen is compared at its pixel: the ratio of the recorded to the drawn
+    picture, of moving surfaces only, blurred over pixels, averaged over time, and interpolated in time where unseen.
+    Drawn with the gains that the scene has already, so that these only need to be multiplied by what is returned.
+    """
+    frames = sorted({*range(0, len(view.rgb), MOVING_STEP), len(view.rgb) - 1})
+    sums = torch.stack([_seen_sums(scene, view, priors, frame, backend) for frame in frames])  # s m 2
+    if len(frames) > 2:
+        padded = torch.nn.functional.pad(sums.permute(1, 2, 0), (1, 1))
+        sums = torch.nn.functional.avg_pool1d(padded, 3, stride=1).permute(2, 0, 1)
+    seen = sums[..., 1] > 0
+    log = torch.where(seen, (sums[..., 0] / sums[..., 1].clamp(min=1e-6)).clamp(min=1e-6).log(), 0.0)
+    return encode_gain(_at_every_frame(log, seen, torch.tensor(frames), len(view.rgb)).exp())
+
+
+def _seen_sums(scene: DynamicScene, view: View, priors: Priors, frame: int, backend: str) -> Float[Tensor, "m 2"]:
+    """Blurred brightness recorded and drawn at the pixel of each moving Gaussian; zero where it is not seen."""
+    camera, when = view.camera.select([frame]), torch.tensor([frame])
+    drawn = to_device(draw(scene, camera, when, backend), "cpu")
+    usable = ((drawn.moving[0] > SURE_WEIGHT) & (priors.instances[frame] > 0)).numpy()
+    recorded, shown = _grey(view.rgb[frame].numpy()), _grey(255 * drawn.rgb[0].numpy())
+    sums = torch.from_numpy(_blurred_sums(recorded, shown, usable))
+    means = scene.at(when).means[0, len(scene.static) :].cpu()
+    row, column, visible = landed(means, camera, drawn.depth[0])
+    own = sums[row, column]
+    seen = visible & (own[:, 2] > SURE_WEIGHT)
+    return own[:, :2] * seen[:, None]
+
+
+def _at_every_frame(
+    values: Float[Tensor, "s m"], known: Bool[Tensor, "s m"], times: Tensor, frames: int
+) -> Float[Tensor, "{frames} m"]:
+    """Values at some times, linearly interpolated between the nearest known ones, held outside, zero where unknown."""
+    index = torch.arange(len(values))[:, None].expand_as(known)
+    before = torch.where(known, index, -1).cummax(0).values
+    after = torch.where(known, index, len(values)).flip(0).cummin(0).values.flip(0)
+    nearest = torch.where(before >= 0, before, after).clamp(max=len(values) - 1)
+    before, after = nearest, torch.where(after < len(values), after, nearest)
+    out = torch.empty(frames, values.shape[1])
+    for frame in range(frames):
+        right = int(torch.searchsorted(times, torch.tensor(frame)))
+        left = right if int(times[right]) == frame else right - 1
+        start, end = before[left], after[right]
+        span = (times[end] - times[start]).clamp(min=1)
+        share = ((frame - times[start]) / span).clamp(0, 1)
+        out[frame] = torch.lerp(values.gather(0, start[None])[0], values.gather(0, end[None])[0], share)
+    return out

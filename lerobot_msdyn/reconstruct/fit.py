@@ -1,0 +1,233 @@
+"""The optimisation: Gaussians are moved, sized and coloured until the recorded camera sees the recorded pictures."""
+
+import logging
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+
+from lerobot_msdyn.core.config import FitConfig, LearningRates
+from lerobot_msdyn.core.errors import EpisodeError
+from lerobot_msdyn.core.serialise import to_device
+from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.priors import Priors
+from lerobot_msdyn.reconstruct.brightness import moving_gain, static_shading
+from lerobot_msdyn.reconstruct.losses import certain_pixels, depth_loss, mask_loss, rgb_loss
+from lerobot_msdyn.scene.draw import Rendering, draw
+from lerobot_msdyn.scene.gaussians import DynamicScene, Gaussians, with_slope
+from lerobot_msdyn.scene.shading import no_shading
+
+logger = logging.getLogger(__name__)
+
+MASK_BAND_PX = 2  # the mask is not trusted closer than this to its border
+FINAL_RATE = 0.1  # the learning rates decay exponentially to this share
+CHECK_STEPS = 50  # from one look at the held-out frames to the next
+GAIN_DB = 0.02  # less than this is no improvement
+SCORED_FRAMES = 5  # of the recorded camera, whose error is reported
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """A fitted scene and how the fit went."""
+
+    scene: DynamicScene
+    losses: dict[str, float]  # mean of each unweighted term over the last tenth of the steps
+    train_psnr_db: float  # over a few frames of the recorded camera
+    steps: int  # how many were taken
+    seconds: float
+    held_out: Int[Tensor, " b"]  # frames that were not fitted
+
+
+@dataclass(frozen=True)
+class _Targets:
+    """What a video's frames should look like, on the device of the scene."""
+
+    view: View
+    depth: Float[Tensor, "t h w"]  # m, 0 = unknown
+    moves: Bool[Tensor, "t h w"]
+    certain: Bool[Tensor, "t h w"]  # where the mask can be trusted
+
+    def terms(self, drawn: Rendering, frames: Int[Tensor, " b"]) -> dict[str, Float[Tensor, ""]]:
+        """All loss terms, unweighted, by the names of their weights."""
+        return {
+            "rgb": rgb_loss(drawn.rgb, self.view.rgb[frames].float() / 255),
+            "depth": depth_loss(drawn.depth, self.depth[frames], drawn.alpha),
+            "mask": mask_loss(drawn.moving, self.moves[frames], self.certain[frames]),
+        }
+
+
+def fit(
+    scene: DynamicScene,
+    view: View,
+    priors: Priors,
+    config: FitConfig,
+    *,
+    empty: UInt8[Tensor, "h w 3"],
+    distance: float,
+    seed: int,
+    backend: str = "auto",
+    progress: Callable[[int], object] = lambda steps: None,
+    learned: Sequence[dict[str, Any]] = (),
+) -> FitResult:
+    """Fit a scene to one camera's video, on the device that holds the scene.
+
+    Motion stays as it was initialised, unless its tensors are `learned`.
+
+    Args:
+        scene: where to start from; it is not changed.
+        view: the video, at the size at which it is fitted; on the host.
+        priors: its priors, at the same size; on the host.
+        config: steps, weights and learning rates.
+        empty: what the camera sees where nothing moves, by which brightness is measured.
+        distance: distance to the look-at point (m), the unit of the means' learning rate.
+        seed: fixes the order of the frames.
+        backend: of the rasterizer.
+        progress: called with the number of steps done since the last call.
+        learned: further groups of parameters for Adam, such as leaves among the scene's levels; changed in place.
+
+    Raises:
+        EpisodeError: the loss is no finite number any more.
+    """
+    start = time.perf_counter()
+    if config.shadows:
+        shading = static_shading(to_device(scene.static, "cpu"), len(scene.moving), view, priors, empty)
+        scene = replace(scene, shading=to_device(shading, scene.device))
+    if config.sh_degree > 0:
+        scene = replace(scene, moving=with_slope(scene.moving))
+    scene, optimizer = _trainable(scene, config.learning_rates, distance)
+    for group in learned:
+        optimizer.add_param_group(group)
+    decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, FINAL_RATE ** (1 / max(config.steps, 1)))
+    moves = priors.instances > 0
+    targets = to_device(_Targets(view, priors.depth, moves, certain_pixels(moves, MASK_BAND_PX)), scene.device)
+    order, held_out = _frames(len(view.rgb), config.held_out_frames, seed)
+    enough = _Enough(targets.view, held_out, config.patience, backend)
+    history: list[dict[str, Tensor]] = []
+    for step in range(config.steps):
+        if step == int(config.moving_gain_from * config.steps) and len(scene.moving) > 0:
+            scene = _with_moving_gain(scene, view, priors, backend)
+        frames = next(order).to(scene.device)
+        terms = targets.terms(draw(scene, targets.view.camera.select(frames), frames, backend), frames)
+        loss = torch.stack([getattr(config.weights, name) * term for name, term in terms.items()]).sum()
+        _check(loss, step, frames)
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()
+        decay.step()
+        history.append({name: term.detach() for name, term in terms.items()})
+        progress(1)
+        if enough(scene, step + 1):
+            break
+    if len(history) < config.steps:
+        progress(config.steps - len(history))
+    return _result(_detached(scene), history, targets.view, held_out, backend, time.perf_counter() - start)
+
+
+@torch.no_grad()
+def psnr(scene: DynamicScene, view: View, frames: Int[Tensor, " b"], backend: str = "auto") -> float:
+    """Peak signal-to-noise ratio (dB) of the drawn against the recorded pictures, which are on one device."""
+    frames = frames.to(view.rgb.device)
+    drawn = draw(scene, view.camera.select(frames), frames, backend).rgb.clamp(0, 1)
+    error = (drawn - view.rgb[frames].float() / 255).square().mean()
+    return float(-10 * torch.log10(error.clamp(min=1e-10)))
+
+
+class _Enough:
+    """Whether held-out frames have stopped to improve."""
+
+    def __init__(self, view: View, held_out: Int[Tensor, " b"], patience: int, backend: str) -> None:
+        self.view, self.held_out, self.patience, self.backend = view, held_out, patience, backend
+        self.best_db, self.best_step = 0.0, 0
+
+    def __call__(self, scene: DynamicScene, steps: int) -> bool:
+        if len(self.held_out) == 0 or steps % CHECK_STEPS != 0:
+            return False
+        now_db = psnr(scene, self.view, self.held_out, self.backend)
+        if now_db > self.best_db + GAIN_DB:
+            self.best_db, self.best_step = now_db, steps
+        return steps - self.best_step >= self.patience
+
+
+def _frames(count: int, held_out: int, seed: int) -> tuple[Iterator[Int[Tensor, "1"]], Int[Tensor, " b"]]:
+    """The frames to train on, one by one without end, each once per round, and those that are held out.
+
+    Of short videos, with fewer than ten frames for each that would be held out, none is.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    apart = torch.zeros(count, dtype=torch.bool)
+    if held_out > 0 and count >= 10 * held_out:
+        apart[torch.linspace(0, count - 1, held_out + 2).round().long()[1:-1]] = True
+    train = (~apart).nonzero()[:, 0]
+
+    def endless() -> Iterator[Int[Tensor, "1"]]:
+        while True:
+            yield from train[torch.randperm(len(train), generator=generator)].split(1)
+
+    return endless(), apart.nonzero()[:, 0]
+
+
+def _check(loss: Float[Tensor, ""], step: int, frames: Int[Tensor, "1"]) -> None:
+    if not bool(torch.isfinite(loss)):
+        raise EpisodeError(
+            f"the fit diverged at step {step}, frame {int(frames)}: the loss is {loss.item()}; expected a finite "
+            "number; look at this episode's depth, or lower fit.learning_rates"
+        )
+
+
+def _with_moving_gain(scene: DynamicScene, view: View, priors: Priors, backend: str) -> DynamicScene:
+    shading = scene.shading or to_device(no_shading(len(scene.static), len(scene.moving), scene.frames), scene.device)
+    gain = moving_gain(scene, view, priors, backend).to(scene.device)
+    return replace(scene, shading=replace(shading, moving=gain))
+
+
+def _result(
+    scene: DynamicScene,
+    history: list[dict[str, Tensor]],
+    view: View,
+    held_out: Int[Tensor, " b"],
+    backend: str,
+    seconds: float,
+) -> FitResult:
+    last = history[-max(1, len(history) // 10) :]
+    losses = {name: float(torch.stack([step[name] for step in last]).mean()) for name in (last[0] if last else {})}
+    frames = torch.linspace(0, len(view.rgb) - 1, min(SCORED_FRAMES, len(view.rgb))).round().long()
+    result = FitResult(scene, losses, psnr(scene, view, frames, backend), len(history), seconds, held_out)
+    logger.info(
+        "fit: %d + %d Gaussians, %d steps in %.0f s, %.1f dB on the recorded camera",
+        len(scene.static),
+        len(scene.moving),
+        result.steps,
+        result.seconds,
+        result.train_psnr_db,
+    )
+    return result
+
+
+def _trainable(
+    scene: DynamicScene, rates: LearningRates, distance: float
+) -> tuple[DynamicScene, torch.optim.Optimizer]:
+    """The scene with its Gaussians as leaves, and Adam over them."""
+    rate = {
+        "means": rates.means * distance,
+        "quats": rates.quats,
+        "log_scales": rates.log_scales,
+        "opacity_logits": rates.opacity_logits,
+        "sh": rates.colours,
+    }
+    static, moving = (
+        Gaussians(**{item.name: getattr(part, item.name).clone().requires_grad_() for item in fields(part)})
+        for part in (scene.static, scene.moving)
+    )
+    groups = [{"params": [getattr(part, name)], "lr": lr} for part in (static, moving) for name, lr in rate.items()]
+    return replace(scene, static=static, moving=moving), torch.optim.Adam(groups, eps=1e-15, fused=True)
+
+
+def _detached(scene: DynamicScene) -> DynamicScene:
+    def plain(part: Gaussians) -> Gaussians:
+        return Gaussians(**{item.name: getattr(part, item.name).detach() for item in fields(part)})
+
+    return replace(scene, static=plain(scene.static), moving=plain(scene.moving))

@@ -1,0 +1,175 @@
+"""From priors to a scene: a static set from the empty scene, and a moving set gathered from several frames."""
+
+import math
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lerobot_msdyn.core.config import MotionConfig, SceneConfig
+from lerobot_msdyn.core.geometry import project, quaternion_multiply, transform_points
+from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.motion.estimate import SceneMotion, scene_motion
+from lerobot_msdyn.motion.to_video.register import Recording
+from lerobot_msdyn.priors import Priors
+from lerobot_msdyn.reconstruct.background import (
+    EmptyScene,
+    background_gaussians,
+    empty_scene,
+    fill_depth,
+    pixel_gaussians,
+)
+from lerobot_msdyn.scene.gaussians import DynamicScene, Gaussians, concatenate, isotropic
+
+MASK_BORDER_PX = 1  # pixels along the border of a mask mix two surfaces
+FRONT_MARGIN = 0.01  # a point nearer than this share of the recorded depth is in front of it
+MAX_CONTRADICTIONS = 0.3  # share of frames in which a point may be missing where it should have been seen
+VOXEL_GROWTH = 1.15  # of the voxels' side, until there are few enough
+EDGE_JUMP = 0.03  # relative difference of neighbouring depths beyond which a pixel may lie between two surfaces
+
+
+def initialise(
+    view: View, priors: Priors, scene: SceneConfig, motion: MotionConfig, empty: EmptyScene | None = None
+) -> DynamicScene:
+    """A scene ready to be fitted.
+
+    Args:
+        view: the video, at the size at which it is fitted.
+        priors: its priors, at the same size.
+        scene: numbers of Gaussians.
+        motion: the levels of motion.
+        empty: what stands still; default: as this video shows it.
+    """
+    if empty is None:
+        empty = empty_scene(view.rgb, priors.depth, priors.instances)
+    static = background_gaussians(empty.rgb, empty.depth, view.camera, scene.static_gaussians)
+    found = _motion(view, priors, motion) if scene.moving_gaussians > 0 else None
+    if found is None:
+        moving = static.select(torch.zeros(0, dtype=torch.long))
+        return DynamicScene(static, moving, (), (), (), len(view.rgb))
+    moving, part = gather_moving(view, priors, found, scene)
+    if scene.isotropic:
+        static, moving = isotropic(static), isotropic(moving)
+    return DynamicScene(static, moving, found.levels, *found.bind(moving.means, part), len(view.rgb))
+
+
+def _motion(view: View, priors: Priors, config: MotionConfig) -> SceneMotion | None:
+    """Motion of everything that was tracked, by what was recorded too where depth is true."""
+    wanted = config.register and priors.metric
+    recording = Recording.of(view.rgb, priors.depth, priors.instances, view.camera) if wanted else None
+    return scene_motion(priors.tracks, priors.depth, view.camera, config, recording)
+
+
+def gather_moving(
+    view: View, priors: Priors, motion: SceneMotion, config: SceneConfig
+) -> tuple[Gaussians, Int[Tensor, " n"]]:
+    """Gaussians of everything that moves, in the canonical frame, and the part of which each is a piece.
+
+    Moving pixels of evenly spread frames are carried back by the motion of their part and merged in voxels of about a
+    pixel's size, so that what one frame hides is taken from another. Larger voxels are used where these are too many.
+    """
+    count = min(config.moving_frames, len(view.rgb))
+    frames = torch.linspace(0, len(view.rgb) - 1, count).round().long().unique().tolist()
+    gathered, parts = [], []
+    for frame in frames:
+        inside = _certain(priors.instances[frame] > 0, priors.depth[frame], config.mask_border_px).reshape(-1)
+        if not bool(inside.any()):
+            continue
+        pixels, _ = pixel_gaussians(view.rgb[frame], fill_depth(priors.depth[frame]), view.camera, frame)
+        pixels = pixels.select(inside)
+        canonical, part = to_canonical(pixels, motion, frame, priors.instances[frame].reshape(-1)[inside].long())
+        gathered.append(canonical)
+        parts.append(part)
+    if not gathered:
+        empty = pixel_gaussians(view.rgb[0], fill_depth(priors.depth[0]), view.camera, 0)[0]
+        return empty.select(torch.zeros(0, dtype=torch.long)), torch.zeros(0, dtype=torch.long)
+    depth = priors.depth[(priors.instances > 0) & (priors.depth > 0)]
+    voxel = config.moving_voxel_px * float(depth.median()) / float(view.camera.intrinsics[0, 0, 0])
+    points, part = concatenate(gathered), torch.cat(parts)
+    extent = float((points.means.amax(0) - points.means.amin(0)).max())
+    growth = 1.0
+    merged = merge_voxels(points, part, voxel)
+    while len(merged[0]) > config.moving_gaussians and growth * voxel <= extent:
+        growth *= VOXEL_GROWTH
+        merged = merge_voxels(points, part, growth * voxel)
+    moving, part = merged
+    kept = ~contradicted(moving.means, part, motion, view, priors, frames)
+    moving, part = moving.select(kept), part[kept]
+    most = slice(config.moving_gaussians)  # one voxel per part may still be too many
+    moving, part = moving.select(most), part[most]
+    return replace(moving, log_scales=moving.log_scales + math.log(growth)), part
+
+
+def contradicted(
+    points: Float[Tensor, "n 3"],
+    part: Int[Tensor, " n"],
+    motion: SceneMotion,
+    view: View,
+    priors: Priors,
+    frames: list[int],
+) -> Bool[Tensor, " n"]:
+    """Canonical points (m) that should have been seen, but were not.
+
+    A point that its part's motion puts in front of the recorded surface, where nothing moves, cannot be there; too
+    many such frames among those in which it is inside the image are held against it.
+    """
+    wrong, inside = torch.zeros(len(points)), torch.zeros(len(points))
+    height, width = priors.depth.shape[1:]
+    for frame in frames:
+        world = motion.moved(points, part, torch.tensor([frame]))[0][0]
+        camera = view.camera.select([frame])
+        xy, z = project(transform_points(camera.camera_from_world, world[None])[0], camera.intrinsics[0])
+        column, row = xy.floor().long().unbind(-1)
+        shown = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (z > 0)
+        column, row = column.clamp(0, width - 1), row.clamp(0, height - 1)
+        surface = priors.depth[frame, row, column]
+        still = _grown(priors.instances[frame] > 0)[row, column].logical_not()
+        wrong += shown & still & (surface > 0) & (z < (1 - FRONT_MARGIN) * surface)
+        inside += shown
+    return wrong > MAX_CONTRADICTIONS * inside
+
+
+def to_canonical(
+    gaussians: Gaussians, motion: SceneMotion, frame: int, instance: Int[Tensor, " n"]
+) -> tuple[Gaussians, Int[Tensor, " n"]]:
+    """Gaussians seen at a frame, carried back to the canonical frame by the motion of their part, and that part."""
+    means, part = motion.to_canonical(gaussians.means, frame, instance)
+    turn = motion.moved(means, part, torch.tensor([frame]))[1][0]
+    back = turn * turn.new_tensor([1.0, -1.0, -1.0, -1.0])
+    return replace(gaussians, means=means, quats=quaternion_multiply(back, gaussians.quats)), part
+
+
+def merge_voxels(gaussians: Gaussians, part: Int[Tensor, " n"], voxel: float) -> tuple[Gaussians, Int[Tensor, " m"]]:
+    """One Gaussian per occupied voxel (side in m) and part: mean position and colour, the first one's shape."""
+    corner = gaussians.means.amin(0)
+    cells = torch.cat((((gaussians.means - corner) / voxel).floor().long(), part[:, None]), dim=1)
+    _, group, count = torch.unique(cells, dim=0, return_inverse=True, return_counts=True)
+    first = torch.full((len(count),), len(group)).scatter_reduce(0, group, torch.arange(len(group)), "amin")
+
+    def mean(values: Float[Tensor, "n *_"]) -> Float[Tensor, "m *_"]:
+        total = torch.zeros(len(count), *values.shape[1:]).index_add_(0, group, values)
+        return total / count.reshape(-1, *[1] * (values.dim() - 1))
+
+    chosen = gaussians.select(first)
+    merged = Gaussians(
+        mean(gaussians.means), chosen.quats, chosen.log_scales, chosen.opacity_logits, mean(gaussians.sh)
+    )
+    return merged, part[first]
+
+
+def _certain(mask: Bool[Tensor, "h w"], depth: Float[Tensor, "h w"], border: int) -> Bool[Tensor, "h w"]:
+    """Pixels `border` px inside a mask, of known depth, and as far from depth edges."""
+    window = np.ones((2 * border + 1,) * 2, np.uint8)
+    inside = cv2.erode(mask.numpy().astype(np.uint8), window, borderType=cv2.BORDER_REPLICATE) > 0
+    z = depth.numpy()
+    edge = cv2.dilate(z, window) > (1 + EDGE_JUMP) * cv2.erode(z, window)
+    return torch.from_numpy(inside & (z > 0) & ~edge)
+
+
+def _grown(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+    """A mask with its border, where it cannot be trusted."""
+    window = np.ones((2 * MASK_BORDER_PX + 3,) * 2, np.uint8)
+    return torch.from_numpy(cv2.dilate(mask.numpy().astype(np.uint8), window) > 0)

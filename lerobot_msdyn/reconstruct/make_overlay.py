@@ -1,0 +1,144 @@
+"""What the recorded camera shows and the scene does not explain is shown as it was recorded, frame by frame."""
+
+import logging
+import math
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numpy import ndarray
+from torch import Tensor
+
+from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.geometry import project, transform_points
+from lerobot_msdyn.core.serialise import to_device
+from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.priors import Priors
+from lerobot_msdyn.reconstruct.background import fill_depth, pixel_gaussians
+from lerobot_msdyn.scene.draw import Rendering, draw, draw_patched
+from lerobot_msdyn.scene.gaussians import DynamicScene
+from lerobot_msdyn.scene.overlay import FramePatch, Overlay, packed
+
+logger = logging.getLogger(__name__)
+
+COLOUR_ERROR = 0.06  # mean absolute difference of colours 0..1, over about a pixel, beyond which one is not explained
+DEPTH_ERROR = 0.02  # relative difference of depths beyond which it is not, at least
+JUMP = 0.05  # relative step of depth to the surface in front, beyond which a pixel belongs to the one behind
+THICKNESS = 0.03  # share of the depth within which a Gaussian belongs to the recorded surface
+SCALE = 0.7  # of a pixel's Gaussian: its neighbours are drawn as well
+ERROR_AROUND = 0.04  # the same over several pixels of the moving set, all of which it then condemns
+_SMOOTH_PX, _AROUND_PX = 1.0, 8.0
+_BESIDE = np.ones((3, 3), np.uint8)  # a pixel and those beside it
+
+
+def unexplained(scene: DynamicScene, view: View, priors: Priors, backend: str = "auto") -> Overlay:
+    """The patches of all frames that make the recorded camera see what it recorded (docs/fit.md, "Overlay").
+
+    A pixel is unexplained where the drawn picture has another colour or depth than the recorded one. There the frame's
+    own pixels are put at their recorded depth, for this frame alone, and Gaussians of the scene in front of that
+    surface or on it are not drawn. What lies behind it stays, and is seen past its edges from other cameras. Depth only
+    contradicts the scene beyond what its provider may err by, and not at all where it is assumed.
+
+    Args:
+        scene: fitted, without an overlay; on any device, the result is on the host.
+        view: the video, at the size at which it was fitted.
+        priors: its depth.
+        backend: of the rasterizer.
+    """
+    patches, still, tolerance = [], None, depth_tolerance(priors)
+    for frame in range(len(view.rgb)):
+        camera, when = view.camera.select([frame]), torch.tensor([frame])
+        depth = fill_depth(priors.depth[frame])
+        if still is None or not view.camera.is_static:
+            still = draw(scene.still(), camera, when, backend).depth[0].cpu()
+        drawn = to_device(draw(scene, camera, when, backend), "cpu")
+        wrong = _wrong(drawn, view.rgb[frame].float() / 255, depth.numpy(), tolerance)
+        taken = wrong & ~_behind_an_edge(depth.numpy(), still.numpy())
+        patches.append(_patch(scene, view, depth, frame, wrong, taken, backend))
+    overlay = packed(patches)
+    share = len(overlay.means) / max(priors.depth.numel(), 1)
+    logger.info("overlay: %.1f %% of the recorded pixels are not explained and shown as recorded", 100 * share)
+    return overlay
+
+
+def depth_tolerance(priors: Priors) -> float:
+    """Relative difference of depths beyond which a picture is wrong; infinite for depth that is only assumed."""
+    if priors.provenance.get("depth", {}).get("provider") == "plane":
+        return math.inf
+    return max(DEPTH_ERROR, priors.depth_error)
+
+
+def _wrong(
+    drawn: Rendering, recorded: Float[Tensor, "h w 3"], depth: Float[ndarray, "h w"], tolerance: float
+) -> Bool[ndarray, "h w"]:
+    """Where a drawn picture has another colour or depth (m) than the recorded one, and the pixels beside."""
+    difference = (drawn.rgb[0].clamp(0, 1) - recorded).abs().mean(-1).numpy()
+    found = drawn.depth[0].numpy()
+    moving = (drawn.moving[0] > 0.5).numpy()
+    around = _blurred(difference * moving, _AROUND_PX) > ERROR_AROUND * _blurred(moving, _AROUND_PX)
+    wrong = (_blurred(difference, _SMOOTH_PX) > COLOUR_ERROR) | (np.abs(found / depth - 1) > tolerance)
+    wrong |= moving & around
+    # Behind an edge colours are mixed, and say nothing; there only the depth of no pixel beside counts as wrong.
+    apart = (depth < (1 - tolerance) * cv2.erode(found, _BESIDE)) | (
+        depth > (1 + tolerance) * cv2.dilate(found, _BESIDE)
+    )
+    wrong = np.where(_behind(depth), apart, wrong)
+    opened = cv2.morphologyEx(wrong.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    return cv2.dilate(opened, _BESIDE) > 0
+
+
+def _blurred(image: Float[ndarray, "h w"] | Bool[ndarray, "h w"], sigma_px: float) -> Float[ndarray, "h w"]:
+    return cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma_px)
+
+
+def _behind(depth: Float[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
+    """Pixels beside a nearer surface."""
+    return depth > (1 + JUMP) * cv2.erode(depth, _BESIDE)
+
+
+def _behind_an_edge(depth: Float[ndarray, "h w"], still: Float[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
+    """Pixels beside a nearer surface, whose colours mix with its own, that float or that the static set shows."""
+    behind = _behind(depth)
+    floating = behind & ((1 + JUMP) * depth < cv2.dilate(depth, _BESIDE))
+    return floating | (behind & (np.abs(still / depth - 1) < DEPTH_ERROR))
+
+
+def _patch(
+    scene: DynamicScene,
+    view: View,
+    depth: Float[Tensor, "h w"],
+    frame: int,
+    wrong: Bool[ndarray, "h w"],
+    taken: Bool[ndarray, "h w"],
+    backend: str,
+) -> FramePatch:
+    """The pixels that are taken as Gaussians, with colours that make the drawn picture the recorded one."""
+    camera, when = view.camera.select([frame]), torch.tensor([frame])
+    chosen = torch.from_numpy(taken).reshape(-1)
+    pixels = pixel_gaussians(view.rgb[frame], depth, view.camera, frame)[0].select(chosen)
+    hidden = _hidden(scene, camera, when, depth, torch.from_numpy(wrong), torch.from_numpy(taken))
+    log_scales, recorded = pixels.log_scales + math.log(SCALE), view.rgb[frame].reshape(-1, 3)[chosen].float() / 255
+    first = FramePatch(pixels.means, pixels.quats, log_scales, recorded, hidden)
+    if len(first) == 0:
+        return first
+    drawn = draw_patched(scene, camera, frame, first, backend).rgb[0].cpu().reshape(-1, 3)[chosen]
+    return FramePatch(pixels.means, pixels.quats, log_scales, (2 * recorded - drawn).clamp(0, 1.5), hidden)
+
+
+def _hidden(
+    scene: DynamicScene,
+    camera: CameraTrack,
+    when: Tensor,
+    depth: Float[Tensor, "h w"],
+    wrong: Bool[Tensor, "h w"],
+    taken: Bool[Tensor, "h w"],
+) -> Bool[Tensor, " g"]:
+    """Gaussians on or before the recorded surface: moving ones where it is wrong, static ones where it is replaced."""
+    snapshot = to_device(scene.at(when), "cpu")
+    xy, z = project(transform_points(camera.camera_from_world, snapshot.means)[0], camera.intrinsics[0])
+    column, row = xy.floor().long().unbind(-1)
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height) & (z > 0)
+    column, row = column.clamp(0, camera.width - 1), row.clamp(0, camera.height - 1)
+    replaced = torch.where(snapshot.moving > 0, wrong[row, column], taken[row, column])
+    return inside & replaced & (z < (1 + THICKNESS) * depth[row, column])

@@ -1,0 +1,62 @@
+"""Moving Gaussians that the video disproves are taken out of a fitted scene."""
+
+import logging
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.serialise import to_device
+from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.scene.draw import draw, landed
+from lerobot_msdyn.scene.gaussians import DynamicScene
+
+logger = logging.getLogger(__name__)
+
+SAMPLES = 40  # frames that are compared
+COLOUR_ERROR = 0.08  # mean absolute difference of colours 0..1, to the most similar of nine pixels
+MOST_WRONG = 0.4  # share of the frames in which it is to be seen in which a Gaussian may have another colour
+
+
+@torch.no_grad()
+def without_disproved(scene: DynamicScene, view: View) -> DynamicScene:
+    """The scene without those of the moving set that have another colour than the video where they are to be seen.
+
+    Where depth is not recorded, points that follow the motion of another body than their own are not contradicted by
+    depth; they are specks of its colour on the other. A Gaussian is compared with the pixel onto which it is projected
+    and those beside it, as edges are a pixel wide.
+
+    Args:
+        scene: fitted, without an overlay.
+        view: the video, at the size at which it was fitted.
+    """
+    count = len(scene.moving)
+    if count == 0:
+        return scene
+    frames = torch.linspace(0, len(view.rgb) - 1, min(SAMPLES, len(view.rgb))).round().long()
+    seen, wrong = (torch.zeros(count, device=scene.device) for _ in range(2))
+    for frame in frames.split(1):
+        camera = to_device(view.camera.select(frame), scene.device)
+        visible, differs = _compared(scene, camera, frame, view.rgb[frame[0]].to(scene.device) / 255)
+        seen += visible
+        wrong += visible & differs
+    kept = wrong <= MOST_WRONG * seen
+    logger.info("%d of %d moving Gaussians disproved by the video", count - int(kept.sum()), count)
+    return scene.select_moving(kept)
+
+
+def _compared(
+    scene: DynamicScene, camera: CameraTrack, frame: Tensor, recorded: Float[Tensor, "h w 3"]
+) -> tuple[Bool[Tensor, " m"], Bool[Tensor, " m"]]:
+    """Which of the moving set are to be seen at a frame, and which have another colour than the pixels there."""
+    snapshot = scene.at(frame, camera.world_from_camera[:, :3, 3])
+    means, colours = snapshot.means[0, len(scene.static) :], snapshot.rgb[0, len(scene.static) :]
+    row, column, visible = landed(means, camera, draw(scene, camera, frame).depth[0])
+    height, width = recorded.shape[:2]
+    error = torch.full_like(means[:, 0], float("inf"))
+    for down in (-1, 0, 1):
+        for right in (-1, 0, 1):
+            pixel = recorded[(row + down).clamp(0, height - 1), (column + right).clamp(0, width - 1)]
+            error = torch.minimum(error, (pixel - colours).abs().mean(-1))
+    return visible, error > COLOUR_ERROR

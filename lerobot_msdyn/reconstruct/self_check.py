@@ -1,0 +1,156 @@
+"""How well a fitted scene explains its own video, at a few frames that the fit never saw: all there is to judge it by.
+
+No ground truth is used. Brightness over time, masks and tracks were measured on these frames as well; the Gaussians
+were not fitted to them. New views are drawn with the overlay, which every frame has of itself: so what is wrong with
+them is judged with it, and what the scene alone makes of frames that it never saw is said beside.
+"""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import kornia
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.geometry import project, transform_points
+from lerobot_msdyn.core.serialise import to_device
+from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.priors import Priors
+from lerobot_msdyn.scene.draw import draw
+from lerobot_msdyn.scene.gaussians import DynamicScene
+
+WITNESSES = 3  # frames that are looked at where none was held out
+STILL_PX = 5  # side of the square around a pixel in which nothing may move for it to stand still
+TRACKED = 400  # points, at most, of which the residual is measured
+SSIM_WINDOW = 11
+DEPTH_FRAMES = 12  # at which the depth of what stands still is compared with itself
+
+
+@dataclass(frozen=True)
+class Witness:
+    """A few recorded frames, and what the scene says of them; all at the size at which the scene was fitted."""
+
+    frames: Int[Tensor, " t"]  # of the scene
+    held_out: bool  # whether the fit never saw them
+    camera: CameraTrack
+    recorded: Float[Tensor, "t h w 3"]  # 0..1
+    depth: Float[Tensor, "t h w"]  # m, prior; 0 = unknown
+    drawn_depth: Float[Tensor, "t h w"]  # m, of the scene with its overlay
+    error: Float[Tensor, " t"]  # mean square colour error of the scene with its overlay, 0..1
+    fitted_error: Float[Tensor, " t"]  # the same without the overlay
+    moving_error: float  # the same over what moves; 0 where nothing does
+    ssim: float  # without the overlay
+    track_px: float  # median distance of the tracks to the motion's projection
+    flicker: float  # mean absolute difference of what stands still to the next frame, 0..1
+    depth_error: float  # relative: what the provider of depth is known for, or more where its depth is less steady
+
+
+def decibels(error: float) -> float:
+    """Peak signal-to-noise ratio (dB) of a mean square error of colours 0..1."""
+    return float(-10 * np.log10(max(error, 1e-6)))
+
+
+@torch.no_grad()
+def witness(scene: DynamicScene, view: View, priors: Priors, held_out: Int[Tensor, " n"]) -> Witness:
+    """What a scene, with its overlay, says of frames that it was not fitted to; of others where `held_out` is empty.
+
+    It is on the host.
+    """
+    total = len(view.rgb)
+    frames = held_out if len(held_out) else torch.linspace(0, total - 1, min(WITNESSES + 2, total)).round().long()
+    if len(held_out) == 0 and total > WITNESSES + 1:
+        frames = frames[1:-1]
+    camera = view.camera.select(frames)
+    drawn = to_device(draw(scene, camera, frames), "cpu")
+    recorded = view.rgb[frames].float() / 255
+    pictures = draw(replace(scene, overlay=None), camera, frames).rgb.clamp(0, 1).cpu()
+    wrong, moving = (pictures - recorded).square().mean(-1), priors.instances[frames] > 0
+    following = (frames + 1).clamp(max=total - 1)
+    still = stands_still(priors.instances[frames] > 0) & stands_still(priors.instances[following] > 0)
+    return Witness(
+        frames,
+        len(held_out) > 0,
+        camera,
+        recorded,
+        priors.depth[frames],
+        drawn.depth,
+        (drawn.rgb.clamp(0, 1) - recorded).square().mean((1, 2, 3)),
+        wrong.mean((1, 2)),
+        float(wrong[moving].mean()) if bool(moving.any()) else 0.0,
+        similarity(pictures, recorded),
+        _track_residual(scene, view.camera, priors),
+        flicker(recorded, view.rgb[following].float() / 255, still),
+        max(priors.depth_error, unsteadiness(priors) if view.camera.is_static else 0.0),
+    )
+
+
+def unsteadiness(priors: Priors) -> float:
+    """Relative standard deviation over time of the depth of what stands still before a fixed camera, at half of it.
+
+    It has one depth, so that this is what its provider errs by at least; errors that stay do not show.
+    """
+    frames = torch.linspace(0, len(priors.depth) - 1, min(DEPTH_FRAMES, len(priors.depth))).round().long()
+    depth = priors.depth[frames]
+    known = (depth > 0) & (priors.instances[frames] == 0)
+    count = known.sum(0)
+    logarithm = depth.clamp(min=1e-6).log() * known
+    mean = logarithm.sum(0) / count.clamp(min=1)
+    variance = ((logarithm - mean) * known).square().sum(0) / count.clamp(min=1)
+    often = count > len(frames) / 2
+    return float(variance[often].sqrt().median()) if bool(often.any()) else 0.0
+
+
+def similarity(one: Float[Tensor, "t h w 3"], other: Float[Tensor, "t h w 3"]) -> float:
+    """Mean structural similarity (SSIM, Wang et al. 2004)."""
+    images = (value.permute(0, 3, 1, 2) for value in (one, other))
+    return float(kornia.metrics.ssim(*images, window_size=SSIM_WINDOW).mean())
+
+
+def stands_still(moving: Bool[Tensor, "t h w"]) -> Bool[Tensor, "t h w"]:
+    """Pixels around which nothing moves."""
+    return torch.nn.functional.max_pool2d(moving.float(), STILL_PX, 1, STILL_PX // 2) == 0
+
+
+def flicker(
+    pictures: Float[Tensor, "t h w 3"], following: Float[Tensor, "t h w 3"], still: Bool[Tensor, "t h w"]
+) -> float:
+    """Mean absolute difference of what stands still to the next frame; 0 where nothing does."""
+    return float((pictures - following).abs().mean(-1)[still].mean()) if bool(still.any()) else 0.0
+
+
+def sharpness(pictures: Float[Tensor, "t h w 3"]) -> float:
+    """Mean variance of the Laplacian of the brightness (0..1)."""
+    grey = (255 * pictures.mean(-1)).numpy()
+    return float(np.mean([cv2.Laplacian(image, cv2.CV_32F).var() for image in grey])) / 255**2
+
+
+def _track_residual(scene: DynamicScene, camera: CameraTrack, priors: Priors) -> float:
+    """Median distance (px) from where a tracked point is seen to where the motion carries it.
+
+    A point is carried as the Gaussian is that is drawn nearest to it where it was first seen.
+    """
+    tracks = priors.tracks
+    if len(tracks) == 0 or len(scene.moving) == 0:
+        return 0.0
+    some = torch.linspace(0, len(tracks) - 1, min(TRACKED, len(tracks))).round().long().unique()
+    visible, xy = tracks.visible[some], tracks.xy[some]
+    first = visible.long().argmax(1)
+    times = torch.linspace(0, scene.frames - 1, min(scene.frames, 12)).round().long()
+    drawn = {int(time): _projected(scene, camera, int(time)) for time in torch.cat((times, first.unique()))}
+    found = []
+    for point in range(len(some)):
+        start = int(first[point])
+        offset = drawn[start] - xy[point, start]
+        nearest = offset.square().sum(-1).argmin()
+        for time in times[visible[point, times]].tolist():
+            found.append((drawn[time][nearest] - offset[nearest] - xy[point, time]).norm())
+    return float(torch.stack(found).median()) if found else 0.0
+
+
+def _projected(scene: DynamicScene, camera: CameraTrack, time: int) -> Float[Tensor, "m 2"]:
+    """Where the moving Gaussians are in the picture (px) at a frame."""
+    means = scene.at(torch.tensor([time])).means[0, len(scene.static) :].cpu()
+    return project(transform_points(camera.camera_from_world[time], means), camera.intrinsics[time])[0]

@@ -1,0 +1,127 @@
+"""Pictures of a dynamic scene: frames from a camera track."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.geometry import project, transform_points
+from lerobot_msdyn.core.serialise import to_device
+from lerobot_msdyn.render import Raster, rasterize
+from lerobot_msdyn.render.cpu.threads import torch_on_one_thread
+from lerobot_msdyn.scene.gaussians import DynamicScene, Snapshot, patched
+from lerobot_msdyn.scene.overlay import FramePatch
+
+BEHIND = 0.01  # share of a surface's depth by which a point may lie behind it and still be what is seen
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What a camera sees of a scene."""
+
+    rgb: Float[Tensor, "t h w 3"]  # 0..1, over black
+    depth: Float[Tensor, "t h w"]  # m, expected z-depth; 0 where nothing is
+    alpha: Float[Tensor, "t h w"]  # 0..1
+    moving: Float[Tensor, "t h w"]  # 0..1, share of the moving set and of overlays
+    extra: Float[Tensor, "t h w"] | None = None  # values of the moving Gaussians, blended like colours
+
+
+def draw(
+    scene: DynamicScene,
+    camera: CameraTrack,
+    frames: Tensor,
+    backend: str = "auto",
+    extra: Float[Tensor, " m"] | None = None,
+) -> Rendering:
+    """The scene at `frames` (int, [b]) through the b poses of `camera`; differentiable.
+
+    `extra` is a value per moving Gaussian to be drawn as well; overlays have one of 1. It is drawn on the scene's
+    device; frames and camera may be on the host.
+    """
+    if scene.overlay is None:
+        camera, frames = to_device((camera, frames), scene.device)
+        return _rasterized(_snapshot(scene, camera, frames, extra), camera, scene.near, backend)
+    own = len(scene.static) + len(scene.moving)
+    drawn = [
+        draw_patched(scene, camera.select([i]), frame, scene.overlay.patch(frame, own), backend, extra)
+        for i, frame in enumerate(frames.tolist())
+    ]
+    names = [item.name for item in fields(Rendering) if getattr(drawn[0], item.name) is not None]
+    return Rendering(**{name: torch.cat([getattr(one, name) for one in drawn]) for name in names})
+
+
+def draw_patched(
+    scene: DynamicScene,
+    camera: CameraTrack,
+    frame: int,
+    patch: FramePatch,
+    backend: str = "auto",
+    extra: Float[Tensor, " m"] | None = None,
+) -> Rendering:
+    """The scene at one frame through one pose, with a patch in place of what the patch hides."""
+    camera, when, patch = to_device((camera, torch.tensor([frame]), patch), scene.device)
+    return _rasterized(patched(_snapshot(scene, camera, when, extra), patch), camera, scene.near, backend)
+
+
+def _snapshot(scene: DynamicScene, camera: CameraTrack, frames: Tensor, extra: Float[Tensor, " m"] | None) -> Snapshot:
+    snapshot = scene.at(frames, camera.world_from_camera[:, :3, 3])
+    if extra is None:
+        return snapshot
+    return replace(snapshot, extra=torch.cat((extra.new_zeros(len(scene.static)), extra)))
+
+
+def _rasterized(snapshot: Snapshot, camera: CameraTrack, near: float, backend: str) -> Rendering:
+    values = [snapshot.moving] if snapshot.extra is None else [snapshot.moving, snapshot.extra]
+    raster: Raster = rasterize(
+        snapshot.means,
+        snapshot.quats,
+        snapshot.scales,
+        snapshot.opacities,
+        torch.cat((snapshot.rgb, torch.stack(values, dim=-1).expand(len(camera), -1, -1)), dim=-1),
+        camera.camera_from_world,
+        camera.intrinsics,
+        camera.width,
+        camera.height,
+        near=near,
+        backend=backend,
+    )
+    rgb, moving, *more = raster.features.split([3] + [1] * len(values), dim=-1)
+    return Rendering(rgb, raster.depth, raster.alpha, moving[..., 0], more[0][..., 0] if more else None)
+
+
+def landed(
+    points: Float[Tensor, "n 3"], camera: CameraTrack, depth: Float[Tensor, "h w"]
+) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"], Bool[Tensor, " n"]]:
+    """Row and column of the pixel of every point (m, world) in a camera of one pose, and whether that pixel shows it.
+
+    It does if the point is inside of the picture, whose drawn depth is `depth` (m), and not behind what is drawn there.
+    What is outside is given the nearest pixel of the border.
+    """
+    height, width = depth.shape
+    xy, z = project(transform_points(camera.camera_from_world[0], points), camera.intrinsics[0])
+    column, row = xy.floor().long().unbind(-1)
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (z > 0)
+    column, row = column.clamp(0, width - 1), row.clamp(0, height - 1)
+    return row, column, inside & (z < (1 + BEHIND) * depth[row, column])
+
+
+@torch.no_grad()
+def render_frames(
+    scene: DynamicScene,
+    camera: CameraTrack,
+    frames: Tensor | None = None,
+    *,
+    batch: int = 8,
+    backend: str = "auto",
+    extra: Float[Tensor, " m"] | None = None,
+) -> Iterator[Rendering]:
+    """The whole scene in batches of frames, so that memory stays bounded; `frames` (int, [t]) defaults to all."""
+    frames = torch.arange(scene.frames) if frames is None else frames
+    for start in range(0, len(frames), batch):
+        part = slice(start, min(start + batch, len(frames)))
+        with torch_on_one_thread():
+            drawn = draw(scene, camera.select(part), frames[part], backend, extra)
+        yield drawn

@@ -1,0 +1,166 @@
+"""The gate: scores of a new view at the witnesses' frames, and whether it is kept, with the reason in words."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+
+from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.config import GateConfig
+from lerobot_msdyn.core.serialise import to_device
+from lerobot_msdyn.reconstruct.self_check import Witness, decibels, flicker, sharpness, stands_still
+from lerobot_msdyn.scene.draw import Rendering, draw
+from lerobot_msdyn.scene.gaussians import DynamicScene
+from lerobot_msdyn.views.coverage import Coverage, Evidence, coverage_of
+from lerobot_msdyn.views.expected_error import Expected, expected_error
+
+HEAT_WIDTH = 24  # columns of the map of what is unseen
+CAUSES = {
+    "video": "the scene does not match its own video (too few steps, wrong masks or motion)",
+    "geometry": "the scene does not stand where the depth says (wrong masks, motion or depth)",
+    "depth": "depth is known too roughly for so large a change of view",
+    "sampling": "the pictures are too fine to be drawn from elsewhere",
+}
+
+
+@dataclass(frozen=True)
+class FrameScores:
+    """Scores of one frame of a new view."""
+
+    frame: int  # of the episode
+    expected_db: float  # expected peak signal-to-noise ratio
+    unseen: float  # share of the pixels that no frame has shown, 0..1
+    angle_deg: float  # mean angle between the new line of sight and the recorded one, where something is seen
+    sharpness_ratio: float  # to the recorded frame
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores of a new view of one episode, by one camera."""
+
+    expected_db: float  # the episode's score: expected peak signal-to-noise ratio over all judged frames
+    causes: dict[str, float]  # share of the expected error by cause, 0..1
+    held_out_db: float  # of the recorded view, on frames that the fit never saw (if held_out), without overlay
+    held_out_ssim: float
+    moving_db: float  # the same over what moves: low where motion is not understood, however little of it there is
+    held_out: bool  # whether there were such frames
+    unseen: float  # mean over the frames, 0..1
+    angle_deg: float
+    track_px: float  # tracks against the motion's projection
+    flicker_ratio: float  # of what stands still, to the source's own
+    sharpness_ratio: float
+    frames: list[FrameScores]
+    heat: list[list[int]]  # percent of the judged frames in which a part of the picture is unseen
+
+
+@dataclass(frozen=True)
+class Witnessed:
+    """One window of an episode: its scene and what is known about it."""
+
+    scene: DynamicScene
+    evidence: Evidence
+    witness: Witness
+    start: int  # first frame of the window in the episode
+
+
+@torch.no_grad()
+def judge(windows: Sequence[Witnessed], camera: CameraTrack) -> Scores:
+    """Scores of an episode seen through another camera (any size, one pose per frame of the episode)."""
+    frames: list[FrameScores] = []
+    expected: list[Expected] = []
+    unseen, steady, own = [], 0.0, 0.0
+    for window in windows:
+        witness = window.witness
+        fitted = witness.camera
+        poses = camera.select(witness.frames + window.start).resized(fitted.width, fitted.height)
+        error = expected_error(witness, poses)
+        drawn, found = _draw(window, poses)
+        pictures = drawn.rgb.clamp(0, 1)
+        after = (witness.frames + 1).clamp(max=window.scene.frames - 1)
+        following = to_device(draw(window.scene, poses, after), "cpu")
+        still = stands_still(drawn.moving > 0.05) & stands_still(following.moving > 0.05)
+        steady += len(poses) * flicker(pictures, following.rgb.clamp(0, 1), still)
+        own += len(poses) * witness.flicker
+        expected.append(error)
+        unseen += [coverage.unseen for coverage in found]
+        for i, (frame, coverage) in enumerate(zip(witness.frames.tolist(), found, strict=True)):
+            ratio = sharpness(pictures[i : i + 1]) / max(sharpness(witness.recorded[i : i + 1]), 1e-9)
+            seen = ~coverage.unseen
+            angle = float(coverage.angle_deg[seen].mean()) if seen.any() else 180.0
+            frames.append(
+                FrameScores(frame + window.start, decibels(float(error.total[i])), coverage.unseen_share, angle, ratio)
+            )
+    total = Expected(**{name: torch.cat([getattr(part, name) for part in expected]) for name in vars(expected[0])})
+    witnesses = [window.witness for window in windows]
+    return Scores(
+        total.psnr_db,
+        total.shares,
+        decibels(float(torch.cat([witness.fitted_error for witness in witnesses]).mean())),
+        float(np.mean([witness.ssim for witness in witnesses])),
+        decibels(float(np.mean([witness.moving_error for witness in witnesses]))),
+        all(witness.held_out for witness in witnesses),
+        float(np.mean([frame.unseen for frame in frames])),
+        float(np.mean([frame.angle_deg for frame in frames])),
+        float(np.mean([witness.track_px for witness in witnesses])),
+        steady / own if own > 0 else 1.0,
+        float(np.mean([frame.sharpness_ratio for frame in frames])),
+        frames,
+        _heat(np.mean(unseen, axis=0)),
+    )
+
+
+def reasons(scores: Scores, config: GateConfig) -> list[str]:
+    """Why a view is not kept, in words; empty if it is."""
+    worst = max(scores.causes, key=lambda name: scores.causes[name])
+    found = []
+    if scores.expected_db < config.min_expected_db:
+        found.append(
+            f"expected quality {scores.expected_db:.1f} dB is under gate.min_expected_db {config.min_expected_db:g}: "
+            f"{CAUSES[worst]}"
+        )
+    for value, limit, name, text in (
+        (scores.track_px, config.max_track_px, "max_track_px", "px from the tracks to the motion"),
+        (scores.flicker_ratio, config.max_flicker_ratio, "max_flicker_ratio", "times the video's own flicker"),
+    ):
+        if value > limit:
+            found.append(f"{value:.1f} {text}, over gate.{name} {limit:g}")
+    if scores.sharpness_ratio < config.min_sharpness_ratio:
+        found.append(
+            f"{scores.sharpness_ratio:.2f} of the video's sharpness, under gate.min_sharpness_ratio "
+            f"{config.min_sharpness_ratio:g}"
+        )
+    return found
+
+
+def record(scores: Scores) -> dict[str, Any]:
+    """Scores as plain values for a JSON file, rounded."""
+    return {name: _plain(value) for name, value in vars(scores).items()}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, float):
+        return round(value, 4)
+    if isinstance(value, dict):
+        return {name: _plain(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    return {name: _plain(item) for name, item in vars(value).items()} if isinstance(value, FrameScores) else value
+
+
+def _draw(window: Witnessed, poses: CameraTrack) -> tuple[Rendering, list[Coverage]]:
+    """The witnesses' frames through other poses, and what is known about their pixels; on the host."""
+    drawn = draw(window.scene, poses, window.witness.frames, extra=window.evidence.moving_frames)
+    return to_device(drawn, "cpu"), coverage_of(drawn, poses, window.witness.frames, window.evidence)
+
+
+def _heat(unseen: Float[ndarray, "h w"]) -> list[list[int]]:
+    """A small map of shares, in percent."""
+    height, width = unseen.shape
+    size = (HEAT_WIDTH, max(1, round(HEAT_WIDTH * height / width)))
+    small = cv2.resize(unseen.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return [[round(100 * float(value)) for value in row] for row in small]

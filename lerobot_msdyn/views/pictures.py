@@ -1,0 +1,162 @@
+"""A reconstructed camera seen from elsewhere: pictures and coverage, frame by frame."""
+
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+from torch import Tensor
+
+from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.config import Fill, Recipe
+from lerobot_msdyn.core.serialise import to_device
+from lerobot_msdyn.reconstruct.fit import FitResult
+from lerobot_msdyn.reconstruct.self_check import Witness
+from lerobot_msdyn.scene.draw import Rendering, render_frames
+from lerobot_msdyn.scene.gaussians import DynamicScene
+from lerobot_msdyn.views.coverage import Coverage, Evidence, coverage_of
+from lerobot_msdyn.views.filling import filled, missing
+from lerobot_msdyn.views.gate import Witnessed
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """One camera's scenes, one per window of its video, and what was known about it."""
+
+    results: tuple[FitResult, ...]
+    starts: tuple[int, ...]  # first frame of each window
+    metric: bool  # whether depth is in true metres, in all windows
+    provenance: dict[str, dict[str, str]]  # prior -> provider, why, model and licence, of all windows
+    camera: CameraTrack  # at the size of the recorded video
+    distance: float  # m, to the look-at point
+    evidence: tuple[Evidence, ...]  # what the recorded camera showed in each window
+    witnesses: tuple[Witness, ...]  # how well each window's scene explains its own video
+
+    @property
+    def windows(self) -> list[Witnessed]:
+        """What a new view is judged by."""
+        parts = zip(self.results, self.evidence, self.witnesses, self.starts, strict=True)
+        return [Witnessed(result.scene, seen, witness, start) for result, seen, witness, start in parts]
+
+    @property
+    def seconds(self) -> float:
+        """Time that was spent in fitting."""
+        return sum(result.seconds for result in self.results)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One frame of a new view."""
+
+    rgb: UInt8[np.ndarray, "h w 3"]
+    depth: Float32[np.ndarray, "h w"]  # m, z-depth; 0 where nothing is known, and everywhere if there is no true scale
+    unseen: Bool[np.ndarray, "h w"]  # what no frame has shown, and was filled in
+
+
+def coverages(scene: Reconstruction, camera: CameraTrack, frames: Tensor | None = None) -> Iterator[Coverage]:
+    """What is known about each pixel of another camera's frames; `frames` as in `new_pictures`."""
+    for _, found, _ in _drawn(scene, camera, frames):
+        yield from found
+
+
+def new_pictures(
+    scene: Reconstruction, camera: CameraTrack, frames: Tensor | None = None, *, fill: Fill = Recipe.fill
+) -> Iterator[Picture]:
+    """The scene through another camera, holes filled; the share of what is unseen is logged at the end.
+
+    `frames` (int, [t]) are those that the poses of `camera` belong to; default: all.
+    """
+    shares: list[float] = []
+    for rendering, found, behind in _drawn(scene, camera, frames, fill):
+        drawn = (rendering.rgb + missing(rendering.alpha)[..., None] * behind).clamp(0, 1)
+        drawn, depths = to_device(((drawn * 255).round().to(torch.uint8), rendering.depth), "cpu")
+        for i, coverage in enumerate(found):
+            shares.append(coverage.unseen_share)
+            known = ~coverage.empty & scene.metric
+            depth = np.where(known, depths[i].numpy(), np.float32(0))
+            yield Picture(drawn[i].numpy(), depth, coverage.unseen)
+    logger.info("%.1f %% of the pixels were never seen (worst frame %.1f %%)", 100 * np.mean(shares), 100 * max(shares))
+
+
+def on_device(scene: Reconstruction, device: torch.device) -> Reconstruction:
+    """The same with what is drawn, and what it is compared with pixel by pixel, on a device."""
+    results, evidence = to_device((scene.results, scene.evidence), device)
+    return replace(scene, results=results, evidence=evidence)
+
+
+class UnseenMasks:
+    """Collects, as pictures pass by, which of their pixels were never seen."""
+
+    def __init__(self) -> None:
+        self._packed: dict[str, list[np.ndarray]] = {}
+        self._width: dict[str, int] = {}
+
+    def kept(self, key: str, pictures: Iterator[Picture]) -> Iterator[Picture]:
+        """The same pictures of a camera."""
+        for picture in pictures:
+            self._packed.setdefault(key, []).append(np.packbits(picture.unseen, axis=-1))
+            self._width[key] = picture.unseen.shape[1]
+            yield picture
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Per camera its masks, uint8 [t, h, ceil(w / 8)], eight pixels of a row to a byte; and NAME.width, px."""
+        masks = {key: np.stack(packed) for key, packed in self._packed.items()}
+        return masks | {f"{key}.width": np.array(width) for key, width in self._width.items()}
+
+
+def _drawn(
+    scene: Reconstruction, camera: CameraTrack, frames: Tensor | None, fill: Fill = "none"
+) -> Iterator[tuple[Rendering, list[Coverage], Float[Tensor, "#t #h #w 3"]]]:
+    """Some frames at a time through another camera, what is known about them, and what stands where nothing is."""
+    frames = torch.arange(len(scene.camera)) if frames is None else frames
+    for window, part in _parts(scene, frames):
+        drawn, evidence = scene.results[window].scene, scene.evidence[window]
+        times, poses = frames[part] - scene.starts[window], camera.select(part)
+        once = _still_filled(drawn, poses, times, fill) if poses.is_static and fill != "none" else None
+        done = 0
+        for rendering in render_frames(drawn, poses, times, extra=evidence.moving_frames):
+            batch = slice(done, done + len(rendering.alpha))
+            done = batch.stop
+            if fill == "none":
+                behind = rendering.rgb.new_zeros(1, 1, 1, 3)
+            elif once is None:
+                behind = torch.stack([_filled(rendering, i, fill) for i in range(len(rendering.alpha))])
+            else:
+                behind = once * _brightness(drawn, times[batch], times)
+            yield rendering, coverage_of(rendering, poses.select(batch), times[batch], evidence), behind
+
+
+def _filled(rendering: Rendering, i: int, fill: Fill) -> Float[Tensor, "h w 3"]:
+    picture = to_device((rendering.rgb[i], rendering.alpha[i], rendering.depth[i]), "cpu")
+    return filled(*picture, fill).to(rendering.rgb.device)
+
+
+def _still_filled(scene: DynamicScene, camera: CameraTrack, times: Tensor, fill: Fill) -> Float[Tensor, "1 h w 3"]:
+    """What stands still through a fixed camera, filled once for all frames, so that nothing flickers."""
+    middle = [len(times) // 2]
+    rendering = next(render_frames(scene.still(), camera.select(middle), times[middle]))
+    return _filled(rendering, 0, fill)[None]
+
+
+def _brightness(scene: DynamicScene, times: Tensor, all_times: Tensor) -> Float[Tensor, "t 1 1 1"] | float:
+    """Mean brightness of what stands still at some times, relative to the middle one."""
+    if scene.shading is None:
+        return 1.0
+    middle = all_times[len(all_times) // 2]
+    gains = scene.shading.static_gain(torch.cat((middle[None], times))).mean(1)
+    return (gains[1:] / gains[0])[:, None, None, None]
+
+
+def _parts(scene: Reconstruction, frames: Int[Tensor, " t"]) -> Iterator[tuple[int, slice]]:
+    """Stretches of frames that are of the same window, in order, with the window."""
+    window = torch.searchsorted(torch.tensor(scene.starts), frames, right=True) - 1
+    start = 0
+    for index, count in zip(
+        *(values.tolist() for values in window.unique_consecutive(return_counts=True)), strict=True
+    ):
+        yield index, slice(start, start + count)
+        start += count

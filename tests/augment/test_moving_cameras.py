@@ -1,0 +1,71 @@
+"""Cameras that move with the robot are told from the others."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from lerobot_msdyn.augment.moving_cameras import correlation, still_cameras, why_moving
+from lerobot_msdyn.core.cameras import intrinsics_from_fov, static_camera
+from lerobot_msdyn.core.config import Recipe
+from lerobot_msdyn.core.errors import DatasetError
+from lerobot_msdyn.dataset.read import Episode, EpisodeSource, View, is_wrist_camera, open_source, select_cameras
+
+FRAMES, WIDTH, HEIGHT = 60, 160, 120
+
+
+def episode(shift: torch.Tensor, state: torch.Tensor | None) -> Episode:
+    """A textured picture that is shifted by so many pixels at each frame."""
+    texture = torch.randint(0, 255, (HEIGHT // 4, WIDTH // 4, 3), generator=torch.Generator().manual_seed(0))
+    picture = texture.to(torch.uint8).repeat_interleave(4, 0).repeat_interleave(4, 1)
+    rgb = torch.stack([picture.roll(int(x), dims=1) for x in shift])
+    camera = static_camera(intrinsics_from_fov(WIDTH, HEIGHT, 60.0), FRAMES, WIDTH, HEIGHT)
+    source = EpisodeSource("local/made_up", Path(), 0)
+    return Episode(source, 30, torch.arange(FRAMES) / 30, {"top": View(rgb, camera)}, state, None, "")
+
+
+def stop_and_go() -> torch.Tensor:
+    speed = torch.zeros(FRAMES)
+    speed[5:20], speed[30:40], speed[48:] = 3.0, -2.0, 1.0
+    return speed.cumsum(0)
+
+
+def test_a_camera_on_the_arm_moves_when_the_state_does() -> None:
+    path = stop_and_go()
+    found = episode(path.round(), path[:, None])
+    assert found.state is not None
+    assert correlation(found.state, found.views["top"].rgb) > 0.8
+    assert "with the robot" in why_moving(found, "top")
+    assert "no state" in why_moving(episode(path.round(), None), "top")
+
+
+def test_a_camera_that_stands_or_moves_by_itself_is_not_refused() -> None:
+    path = stop_and_go()
+    assert why_moving(episode(torch.zeros(FRAMES), path[:, None]), "top") == ""
+    assert why_moving(episode(2 * torch.arange(FRAMES), path[:, None]), "top") == ""
+
+
+@pytest.mark.parametrize("name", ["wrist", "left_hand", "gripper_cam", "eye_in_hand", "end_effector", "tool0"])
+def test_names_of_cameras_on_the_robot(name: str) -> None:
+    assert is_wrist_camera(f"observation.images.{name}")
+
+
+@pytest.mark.parametrize("name", ["front", "top", "overhead", "side", "laptop"])
+def test_names_of_cameras_beside_the_robot(name: str) -> None:
+    assert not is_wrist_camera(f"observation.images.{name}")
+
+
+def test_a_wrist_camera_is_rendered_only_where_that_is_allowed(image_desk: Path) -> None:
+    source = open_source("local/desk", image_desk)
+    wrist = "observation.images.wrist"
+    assert wrist not in select_cameras(source, None)
+    with pytest.raises(DatasetError, match=r"wrist moves with the robot, by its name.*--allow_moving"):
+        select_cameras(source, ["wrist"])
+    assert select_cameras(source, ["wrist"], allow_moving=True) == [wrist]
+    assert wrist in select_cameras(source, None, allow_moving=True)
+
+
+def test_cameras_on_stands_are_kept(desk: Path) -> None:
+    source = open_source("local/desk", desk)
+    cameras = select_cameras(source, None)
+    assert still_cameras(source, 0, cameras, Recipe()) == cameras

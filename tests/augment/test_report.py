@@ -1,0 +1,176 @@
+"""The report: one file, nothing from outside, every text escaped, bounded."""
+
+import dataclasses
+import html.parser
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lerobot_msdyn.augment.report import build
+
+from lerobot_msdyn.augment import __main__ as augment
+from lerobot_msdyn.augment.report.drawing import cameras_from_above
+from lerobot_msdyn.augment.report.page import LISTED, Pictures, ViewEntry, page
+from lerobot_msdyn.augment.report.pictures import data_url, film, heat_map, spread, strip
+from lerobot_msdyn.reconstruct import reconstruct as pipeline
+
+FRONT = "observation.images.front"
+FAST = ("--fit.steps", "4", "--scene.moving_gaussians", "500", "--scene.moving_frames", "4", "--fit.max_width", "48")
+NASTY = "<script>alert('x')</script>\"&"
+SCORES = {
+    "expected_db": 21.5,
+    "held_out_db": 27.0,
+    "moving_db": 21.0,
+    "held_out_ssim": 0.9,
+    "unseen": 0.05,
+    "angle_deg": 4.0,
+    "track_px": 0.5,
+    "flicker_ratio": 0.4,
+    "sharpness_ratio": 0.6,
+    "causes": {"video": 0.6, "geometry": 0.4},
+    "frames": [{"frame": 3, "expected_db": 21.5, "unseen": 0.05, "angle_deg": 4.0, "sharpness_ratio": 0.6}],
+    "heat": [[0, 50], [100, 0]],
+}
+VOID = {"meta", "img", "br", "circle", "polygon", "polyline"}
+
+
+class Outline(html.parser.HTMLParser):
+    """Tags in order; complains where they are not closed as they were opened."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.links: list[str] = []
+        self._open: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.links += [value or "" for name, value in attrs if name in ("src", "href", "srcset")]
+        if tag not in VOID:
+            self._open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag not in VOID:
+            assert self._open.pop() == tag
+
+    def finished(self) -> "Outline":
+        self.close()
+        assert self._open == []
+        return self
+
+
+def outline(text: str) -> Outline:
+    found = Outline()
+    found.feed(text)
+    return found.finished()
+
+
+def entry(episode: int = 0, **changes: object) -> ViewEntry:
+    view = {"camera_from_source": np.eye(4).tolist(), "distance_m": 0.6, "scores": SCORES}
+    plain = ViewEntry(episode, 0, FRONT, {"azimuth_deg": 3.0, "shift_x_m": 0.01}, view, [], dropped=False)
+    return dataclasses.replace(plain, **changes)
+
+
+def test_every_text_is_escaped() -> None:
+    pictures = Pictures("data:image/jpeg;base64,", "data:image/jpeg;base64,", 3, 2.0, None)
+    entries = [
+        entry(camera=NASTY, drawn={NASTY: 1.0}, rejected=[NASTY], pictures=pictures),
+        entry(camera=NASTY, rejected=[NASTY], dropped=True),
+    ]
+    text = page(NASTY, {NASTY: NASTY}, entries, [NASTY])
+    assert "<script" not in text
+    assert "alert(&#x27;x&#x27;)" in text
+    assert "script" not in outline(text).tags
+
+
+def test_a_dropped_view_says_why_and_a_redrawn_one_too() -> None:
+    text = page("ds", {}, [entry(rejected=["too dark"], dropped=True)], ["episode 3: no video"])
+    assert "Why it was dropped" in text
+    assert "dropped: too dark" in text
+    assert "episode 3: no video" in text
+    pictures = Pictures("", "", 1, 1.0, None)
+    assert "Drawn again, since" in page("ds", {}, [entry(rejected=["too dark"], pictures=pictures)], [])
+
+
+def test_views_that_were_not_judged_are_shown_as_such() -> None:
+    view = {"camera_from_source": np.eye(4).tolist(), "distance_m": 0.6}
+    text = page("ds", {}, [entry(view=view, pictures=Pictures("", "", 1, 1.0, None))], [])
+    assert "not judged" in text
+    outline(text)
+
+
+def test_the_page_is_bounded() -> None:
+    many = [entry(i) for i in range(LISTED + 500)]
+    text = page("ds", {}, many, [])
+    assert "500 more are in meta/msdyn/episodes.parquet" in text
+    assert len(text) < 1_000_000
+    scored = [entry(i, view={"scores": {"expected_db": 100.0 - i}}) for i in range(100)]
+    chosen = build._pictured(scored)
+    assert len(chosen) == build.PICTURED
+    assert {99, 98, 0, 1} <= chosen
+
+
+def test_cameras_from_above_stay_inside_the_picture() -> None:
+    moved = np.eye(4)
+    moved[:3, 3] = [0.3, 0.1, -0.2]
+    text = cameras_from_above([moved.tolist(), np.eye(4).tolist()], 0.5)
+    points = re.findall(r"(-?[\d.]+),(-?[\d.]+)", text)
+    assert len(points) == 3 * (2 + 3)
+    assert all(0 <= float(value) <= 260 for point in points for value in point)
+
+
+def test_pictures() -> None:
+    before = [np.full((48, 64, 3), value, np.uint8) for value in (10, 60, 110)]
+    after = [np.full((48, 64, 3), value, np.uint8) for value in (20, 70, 120)]
+    assert strip(before, after).shape == (2 * 168 + 4, 3 * 224 + 2 * 4, 3)
+    assert film(before, after).shape == (180, 3 * 480, 3)
+    found = heat_map(after[0], [[0, 100]])
+    assert found[0, -1, 0] > found[0, 0, 0] + 50
+    assert found[0, 0, 0] == found[0, 0, 1]
+    assert spread(100, 3).tolist() == [0, 50, 99]
+    assert spread(2, 5).tolist() == [0, 1]
+    assert data_url(before[0]).startswith("data:image/jpeg;base64,/9j/")
+
+
+@pytest.fixture(scope="module")
+def reported(desk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("reported") / "new"
+    arguments = ["--repo", "local/desk", "--root", str(desk), "--new_root", str(out), "--episodes", "[0]"]
+    assert augment.run([*arguments, "--cameras", "[front]", "--variants", "2", *FAST]) == 0
+    return out
+
+
+def test_a_run_leaves_a_report_that_needs_nothing_else(reported: Path) -> None:
+    text = (reported / "report.html").read_text()
+    found = outline(text)
+    assert found.tags.count("article") == 2
+    assert all(link.startswith("data:image/") for link in found.links)
+    assert not re.search(r"(https?:)?//", re.sub(r"data:image/jpeg;base64,[A-Za-z0-9+/=]+", "", text))
+    assert len(text) < 2_000_000
+
+
+def test_what_the_gate_rejects_is_drawn_again_and_then_dropped(
+    desk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = []
+    judge = pipeline.judge
+
+    def counted(windows: object, camera: object) -> object:
+        drawn.append(camera)
+        scores = judge(windows, camera)
+        return dataclasses.replace(scores, expected_db=1.0) if len(drawn) in (1, 2, 3, 4) else scores
+
+    monkeypatch.setattr(pipeline, "judge", counted)
+    arguments = ["--repo", "local/desk", "--root", str(desk), "--new_root", str(tmp_path / "new"), "--episodes", "[0]"]
+    settings = ["--cameras", "[front]", "--variants", "2", "--gate.redraws", "2", *FAST]
+    assert augment.run([*arguments, *settings]) == 1
+    said = capsys.readouterr().out
+    assert "dropped: episode 0 variant 0: " in said
+    assert "1 new ones" in said
+    assert len(drawn) == 3 + 2
+    poses = {tuple(camera.world_from_camera[0].flatten().tolist()) for camera in drawn}
+    assert len(poses) == len(drawn)
+    text = (tmp_path / "new" / "report.html").read_text()
+    assert "Why it was dropped" in text
+    assert "Drawn again, since" in text

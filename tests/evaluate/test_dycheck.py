@@ -1,0 +1,67 @@
+"""Sequences from the command line: fitted, drawn and scored by both protocols."""
+
+import importlib
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from lerobot_msdyn.core.config import Protocol
+from lerobot_msdyn.core.errors import ConfigError
+from lerobot_msdyn.evaluate import __main__ as evaluate
+from lerobot_msdyn.evaluate.dycheck.iphone import read_sequence
+from lerobot_msdyn.evaluate.metrics import masked_psnr_db, partial_ssim
+
+FAST = ("--fit.steps", "30", "--scene.moving_frames", "4", "--scene.overlay", "false")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("protocol", ["som", "dycheck"])
+def test_the_fit_beats_the_recorded_picture(
+    sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], protocol: Protocol
+) -> None:
+    if protocol == "som":
+        pytest.importorskip("pycolmap")
+    arguments = ["dycheck", "--root", str(sequence), "--out", str(tmp_path), "--protocol", protocol]
+    assert evaluate.run([*arguments, *FAST]) == 0
+    said = capsys.readouterr().out
+    assert f"protocol {protocol}" in said
+    assert "mLPIPS is left out" in said
+    found = json.loads((tmp_path / "scores.json").read_text())
+    fitted, unchanged = found["mean"]["this fit"], found["mean"]["recorded picture of that time"]
+    assert fitted["mpsnr"] > unchanged["mpsnr"] + 2
+    assert fitted["mssim"] > unchanged["mssim"]
+    truth = read_sequence(sequence, protocol)
+    assert sorted(path.stem for path in (tmp_path / "rgb").iterdir()) == sorted(truth.validation)
+    for name in truth.validation:  # the scores are those of the pictures that were written
+        drawn = cv2.imread(str(tmp_path / "rgb" / f"{name}.png"), cv2.IMREAD_COLOR_RGB)
+        true, mask = truth.true_picture(name), truth.covisible(name)
+        assert found["images"][name]["mpsnr"] == pytest.approx(masked_psnr_db(drawn, true, mask), abs=1e-4)
+        assert found["images"][name]["mssim"] == pytest.approx(partial_ssim(drawn, true, mask), abs=1e-4)
+    means = {score: np.mean([image[score] for image in found["images"].values()]) for score in fitted}
+    assert fitted == pytest.approx(means, abs=1e-4)
+
+
+def test_the_table_of_five_sequences(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """From scores that are there already: means over all five, beside published rows of the same protocol only."""
+    monkeypatch.syspath_prepend(Path(__file__).parent.parent.parent / "benchmarks")
+    benchmark = importlib.import_module("dycheck")
+    for i, name in enumerate(benchmark.SEQUENCES):
+        (tmp_path / name).mkdir()
+        mean = {"this fit": {"mpsnr": 15.0 + i, "mssim": 0.6}}
+        (tmp_path / name / "scores.json").write_text(json.dumps({"protocol": "som", "mean": mean}))
+    arguments = ["--data", str(tmp_path), "--out", str(tmp_path)]
+    assert benchmark.main(arguments) == 0
+    said = capsys.readouterr().out
+    assert "| this fit, spin | 18.00 | 0.600 | - |" in said
+    assert "| this fit, mean | 17.00 | 0.600 | - |" in said
+    assert "| published: the paper | 17.07 | 0.66 | 0.38 |" in said
+    assert "T-NeRF (DyCheck)" not in said
+    with pytest.raises(ConfigError, match="is of protocol som, not dycheck"):
+        benchmark.main([*arguments, "--protocol", "dycheck"])
+    assert benchmark.main([*arguments, "--sequences", "apple", "spin"]) == 0
+    assert "this fit, mean" not in capsys.readouterr().out

@@ -1,0 +1,164 @@
+"""The optimisation: it gets closer, it is repeatable, and it leaves its input alone."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from lerobot_msdyn.core.cameras import intrinsics_from_fov, static_camera
+from lerobot_msdyn.core.config import FitConfig, LearningRates
+from lerobot_msdyn.core.errors import EpisodeError
+from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.motion.model.bases import identity_level
+from lerobot_msdyn.priors import PointTracks, Priors
+from lerobot_msdyn.reconstruct.background import background_gaussians
+from lerobot_msdyn.reconstruct.fit import FitResult, fit, psnr
+from lerobot_msdyn.scene.gaussians import DynamicScene
+
+WIDTH, HEIGHT, FRAMES = 32, 24, 3
+
+
+def still_video() -> tuple[View, Priors]:
+    """A checkered wall 1 m away, three times the same frame."""
+    y, x = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
+    checks = (60 + 130 * ((x // 8 + y // 8) % 2)).to(torch.uint8)
+    rgb = checks[None, ..., None].expand(FRAMES, -1, -1, 3).contiguous()
+    camera = static_camera(intrinsics_from_fov(WIDTH, HEIGHT, 60.0), FRAMES, WIDTH, HEIGHT)
+    nothing = PointTracks(
+        torch.zeros(0, FRAMES, 2),
+        torch.zeros(0, FRAMES, dtype=torch.bool),
+        torch.zeros(0, FRAMES),
+        torch.zeros(0, dtype=torch.long),
+    )
+    instances = torch.zeros(FRAMES, HEIGHT, WIDTH, dtype=torch.uint8)
+    return View(rgb, camera), Priors(torch.ones(FRAMES, HEIGHT, WIDTH), instances, nothing, metric=True)
+
+
+def grey_scene(view: View) -> DynamicScene:
+    """The right shapes in the wrong colour."""
+    grey = torch.full((HEIGHT, WIDTH, 3), 128, dtype=torch.uint8)
+    static = background_gaussians(grey, torch.ones(HEIGHT, WIDTH), view.camera, 10_000)
+    none = static.select(torch.zeros(0, dtype=torch.long))
+    level = identity_level(torch.zeros(1, 3), FRAMES)
+    return DynamicScene(static, none, (level,), (torch.zeros(0, 1, dtype=torch.long),), (torch.zeros(0, 1),), FRAMES)
+
+
+def run(steps: int, seed: int = 0) -> tuple[DynamicScene, FitResult]:
+    view, priors = still_video()
+    scene = grey_scene(view)
+    config = FitConfig(steps=steps)
+    config.learning_rates.colours = 0.1
+    return scene, fit(scene, view, priors, config, empty=view.rgb[0], distance=1.0, seed=seed)
+
+
+def test_the_fit_gets_closer_to_the_recorded_pictures() -> None:
+    view, _ = still_video()
+    before, result = run(40)
+    assert result.train_psnr_db > psnr(before, view, torch.arange(FRAMES)) + 6
+    assert set(result.losses) == {"rgb", "depth", "mask"}
+    assert result.losses["depth"] < 0.05
+
+
+def test_the_scene_that_was_given_is_not_changed() -> None:
+    view, _ = still_video()
+    before, result = run(3)
+    expected = grey_scene(view)
+    for item in dataclasses.fields(expected.static):
+        assert torch.equal(getattr(before.static, item.name), getattr(expected.static, item.name))
+    assert not torch.equal(result.scene.static.sh, before.static.sh)
+    assert not result.scene.static.sh.requires_grad
+    assert result.scene.levels is before.levels
+
+
+def test_motion_is_learned_where_its_tensors_are_given() -> None:
+    view, priors = still_video()
+    scene = grey_scene(view)
+    shift = scene.levels[0].displacements.clone().requires_grad_()  # type: ignore[union-attr]
+    before = shift.detach().clone()
+    count = len(scene.static)
+    scene = dataclasses.replace(
+        scene,
+        moving=scene.static,
+        levels=(dataclasses.replace(scene.levels[0], displacements=shift),),
+        indices=(torch.zeros(count, 1, dtype=torch.long),),
+        logits=(torch.zeros(count, 1),),
+    )
+    learned = [{"params": [shift], "lr": 1e-3}]
+    result = fit(scene, view, priors, FitConfig(steps=3), empty=view.rgb[0], distance=1.0, seed=0, learned=learned)
+    assert result.scene.levels is scene.levels
+    assert not torch.equal(shift, before)
+
+
+def test_same_seed_same_result() -> None:
+    assert torch.equal(run(5)[1].scene.static.sh, run(5)[1].scene.static.sh)
+
+
+def test_no_steps_at_all() -> None:
+    before, result = run(0)
+    assert torch.equal(result.scene.static.sh, before.static.sh)
+    assert result.losses == {}
+
+
+def test_progress_is_reported_step_by_step() -> None:
+    view, priors = still_video()
+    seen: list[int] = []
+    fit(
+        grey_scene(view),
+        view,
+        priors,
+        FitConfig(steps=4),
+        empty=view.rgb[0],
+        distance=1.0,
+        seed=0,
+        progress=seen.append,
+    )
+    assert seen == [1, 1, 1, 1]
+
+
+def test_a_weight_of_zero_switches_a_term_off() -> None:
+    view, priors = still_video()
+    config = FitConfig(steps=5)
+    config.weights.rgb, config.weights.depth, config.weights.mask = 0.0, 0.0, 0.0
+    scene = grey_scene(view)
+    result = fit(scene, view, priors, config, empty=view.rgb[0], distance=1.0, seed=0)
+    assert torch.equal(result.scene.static.sh, scene.static.sh)
+
+
+@pytest.mark.parametrize("gone", ["depth", "frames"])
+def test_unknown_depth_is_no_obstacle(gone: str) -> None:
+    view, priors = still_video()
+    depth = torch.zeros_like(priors.depth) if gone == "depth" else priors.depth.index_fill(0, torch.tensor([1]), 0.0)
+    result = fit(
+        grey_scene(view),
+        view,
+        dataclasses.replace(priors, depth=depth),
+        FitConfig(steps=3),
+        empty=view.rgb[0],
+        distance=1.0,
+        seed=0,
+    )
+    assert torch.isfinite(result.scene.static.means).all()
+
+
+def test_the_fit_stops_when_held_out_frames_no_longer_improve() -> None:
+    view, priors = still_video()
+    many = dataclasses.replace(view, rgb=view.rgb[:1].expand(12, -1, -1, -1), camera=view.camera.select([0] * 12))
+    known = dataclasses.replace(
+        priors, depth=priors.depth[:1].expand(12, -1, -1), instances=priors.instances[:1].expand(12, -1, -1)
+    )
+    config = FitConfig(steps=400, held_out_frames=1, patience=50)
+    scene = dataclasses.replace(grey_scene(view), frames=12, levels=(identity_level(torch.zeros(1, 3), 12),))
+    config.learning_rates = LearningRates(0.0, 0.0, 0.0, 0.0, 0.0)  # nothing ever improves
+    seen: list[int] = []
+    result = fit(scene, many, known, config, empty=view.rgb[0], distance=1.0, seed=0, progress=seen.append)
+    assert result.steps == 100
+    assert sum(seen) == 400
+
+
+def test_numbers_that_are_not_finite_end_the_fit() -> None:
+    view, priors = still_video()
+    scene = grey_scene(view)
+    config = FitConfig(steps=3)
+    config.weights.rgb = float("inf")
+    with pytest.raises(EpisodeError, match="diverged at step 0, frame"):
+        fit(scene, view, priors, config, empty=view.rgb[0], distance=1.0, seed=0)

@@ -1,0 +1,146 @@
+"""From a video to its scenes and new pictures, also where the video is not as one would wish."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from lerobot_msdyn.core.config import Recipe
+from lerobot_msdyn.dataset.read import View, open_source
+from lerobot_msdyn.priors import Priors, estimate_priors
+from lerobot_msdyn.reconstruct import reconstruct as pipeline
+from lerobot_msdyn.reconstruct.reconstruct import Picture, by_feature, new_pictures, reconstruct
+from lerobot_msdyn.synthetic import make_scene
+
+FRAMES, WIDTH, HEIGHT = 12, 64, 48
+
+
+@pytest.fixture(scope="module")
+def pushed() -> View:
+    scene = make_scene("push", 0, FRAMES, WIDTH, HEIGHT)
+    seen = scene.render(scene.camera)
+    return View(seen.rgb, scene.camera, seen.depth)
+
+
+def recipe(steps: int = 10) -> Recipe:
+    found = Recipe()
+    found.fit.steps = steps
+    return found
+
+
+def some(view: View, frames: list[int]) -> View:
+    """Some frames of a video, also repeated."""
+    depth = None if view.depth is None else view.depth[frames]
+    return View(view.rgb[frames], view.camera.select(frames), depth)
+
+
+def check(view: View, settings: Recipe) -> None:
+    """Every frame can be drawn, and looks about like the recorded one from the recorded camera."""
+    pictures = list(new_pictures(reconstruct(view, settings), view.camera))
+    assert len(pictures) == len(view.rgb)
+    for picture, recorded in zip(pictures, view.rgb, strict=True):
+        assert picture.rgb.shape == (HEIGHT, WIDTH, 3)
+        assert abs(picture.rgb.astype(int) - recorded.numpy()).mean() < 40
+        assert torch.isfinite(torch.from_numpy(picture.depth)).all()
+
+
+@pytest.mark.parametrize("frames", [1, 2, 5])
+def test_very_short_videos(pushed: View, frames: int) -> None:
+    check(some(pushed, list(range(frames))), recipe())
+
+
+def test_nothing_moves(pushed: View) -> None:
+    check(some(pushed, [3] * FRAMES), recipe())
+
+
+def test_everything_moves(pushed: View) -> None:
+    rolled = torch.stack([image.roll(5 * t, dims=1) for t, image in enumerate(pushed.rgb)])
+    check(dataclasses.replace(pushed, rgb=rolled), recipe())
+
+
+def test_a_frozen_stretch(pushed: View) -> None:
+    check(some(pushed, [0, 1, 2, 3, 3, 3, 3, 3, 4, 5, 6, 7]), recipe())
+
+
+def test_a_black_stretch(pushed: View) -> None:
+    rgb = pushed.rgb.clone()
+    rgb[4:7] = 0
+    pictures = list(new_pictures(reconstruct(dataclasses.replace(pushed, rgb=rgb), recipe()), pushed.camera))
+    assert len(pictures) == FRAMES
+
+
+def test_a_cut(pushed: View) -> None:
+    rgb = pushed.rgb.clone()
+    rgb[6:] = rgb[6:].flip(2)
+    pictures = list(new_pictures(reconstruct(dataclasses.replace(pushed, rgb=rgb), recipe()), pushed.camera))
+    assert len(pictures) == FRAMES
+
+
+@pytest.mark.parametrize("scale", [0.01, 0.1, 30.0])
+def test_depth_of_the_wrong_scale(pushed: View, scale: float) -> None:
+    assert pushed.depth is not None
+    check(dataclasses.replace(pushed, depth=pushed.depth * scale), recipe())
+
+
+def test_unmeasured_depth(pushed: View) -> None:
+    assert pushed.depth is not None
+    depth = pushed.depth.clone()
+    depth[2:5] = torch.nan
+    depth[7, :20] = torch.inf
+    depth[9] = 0
+    check(dataclasses.replace(pushed, depth=depth), recipe())
+
+
+@pytest.mark.parametrize("lost", ["from the middle on", "at every other frame", "all"])
+def test_lost_tracks(pushed: View, monkeypatch: pytest.MonkeyPatch, lost: str) -> None:
+    def estimated(*arguments: Any, **named: Any) -> Priors:
+        priors = estimate_priors(*arguments, **named)
+        visible = priors.tracks.visible.clone()
+        gone = {"from the middle on": slice(FRAMES // 2, None), "at every other frame": slice(0, None, 2)}
+        visible[:, gone.get(lost, slice(None))] = False
+        return dataclasses.replace(priors, tracks=dataclasses.replace(priors.tracks, visible=visible))
+
+    monkeypatch.setattr(pipeline, "estimate_priors", estimated)
+    check(pushed, recipe())
+
+
+def test_windows_whose_priors_differ_say_so(pushed: View, monkeypatch: pytest.MonkeyPatch) -> None:
+    known = iter([True, False])
+
+    def estimated(*arguments: Any, **named: Any) -> Priors:
+        priors, metric = estimate_priors(*arguments, **named), next(known)
+        depth = {"provider": "recorded" if metric else "plane", "why": "of this test"}
+        return dataclasses.replace(priors, metric=metric, provenance=priors.provenance | {"depth": depth})
+
+    monkeypatch.setattr(pipeline, "estimate_priors", estimated)
+    settings = recipe()
+    settings.fit.window_frames = 6
+    found = reconstruct(pushed, settings)
+    assert found.provenance["depth"] == {"provider": "recorded; plane", "why": "of this test"}
+    assert found.provenance["masks"]["provider"] == "change"
+    assert not found.metric
+
+
+def test_a_long_video_is_fitted_in_windows(pushed: View) -> None:
+    settings = recipe()
+    settings.fit.window_frames = 5
+    found = reconstruct(pushed, settings)
+    assert found.starts == (0, 4, 8)
+    assert [result.scene.frames for result in found.results] == [4, 4, 4]
+    check(pushed, settings)
+    frames = torch.tensor([7, 0, 9])
+    whole = list(new_pictures(found, pushed.camera))
+    for picture, frame in zip(new_pictures(found, pushed.camera.select(frames), frames), frames, strict=True):
+        assert abs(picture.rgb.astype(int) - whole[int(frame)].rgb).max() <= 1
+
+
+def test_depth_is_rendered_where_it_is_recorded_and_wanted(desk: Path) -> None:
+    source, key = open_source("local/desk", desk), "observation.images.front"
+    picture = Picture(
+        np.zeros((HEIGHT, WIDTH, 3), np.uint8), np.ones((HEIGHT, WIDTH), np.float32), np.zeros((HEIGHT, WIDTH), bool)
+    )
+    for depth, features in ((True, [key, f"{key}_depth"]), (False, [key])):
+        assert [list(found) for found in by_feature(source, {key: iter([picture])}, depth=depth)] == [features]

@@ -1,0 +1,40 @@
+"""What stands where nobody has seen anything."""
+
+import pytest
+import torch
+
+from lerobot_msdyn.views.filling import filled, missing
+
+
+def beside_an_object() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """A grey wall at 1 m, a red object at 0.6 m before it, and a hole along the object's right side."""
+    rgb, depth, alpha = torch.full((40, 60, 3), 0.5), torch.full((40, 60), 1.0), torch.ones(40, 60)
+    rgb[10:30, 10:30], depth[10:30, 10:30] = torch.tensor([0.9, 0.0, 0.0]), 0.6
+    hole = (slice(10, 30), slice(30, 36))
+    rgb[hole], depth[hole], alpha[hole] = 0.0, 0.0, 0.0
+    return rgb, alpha, depth
+
+
+@pytest.mark.parametrize("fill", ["inpaint", "nearest"])
+def test_what_an_object_hid_is_continued_from_behind_it(fill: str) -> None:
+    rgb, alpha, depth = beside_an_object()
+    found = filled(rgb, alpha, depth, fill)
+    assert ((found[10:30, 30:36] - 0.5).abs() < 0.02).all()
+    assert torch.equal(found[:, :30], rgb[:, :30])
+
+
+def test_beyond_the_border_the_picture_goes_on() -> None:
+    rgb, alpha, depth = beside_an_object()
+    alpha[:, 50:], rgb[:, 50:] = 0, 0
+    assert (filled(rgb, alpha, depth, "inpaint")[:, 50:] > 0.4).all()
+
+
+def test_nothing_or_everything_known() -> None:
+    rgb = torch.rand(8, 8, 3)
+    for alpha in (torch.ones(8, 8), torch.zeros(8, 8)):
+        assert filled(rgb, alpha, torch.ones(8, 8), "inpaint").shape == rgb.shape
+    assert torch.equal(filled(rgb, torch.ones(8, 8), torch.ones(8, 8), "inpaint"), rgb)
+
+
+def test_solid_surfaces_are_left_as_they_are() -> None:
+    assert missing(torch.tensor([0.0, 0.45, 0.9, 1.0])).tolist() == pytest.approx([1.0, 0.5, 0.0, 0.0])

@@ -1,0 +1,169 @@
+"""The gate: what it expects of a new view, and which ones it keeps, without ground truth."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.config import GateConfig, Recipe
+from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.priors import PointTracks, Priors
+from lerobot_msdyn.reconstruct.reconstruct import reconstruct
+from lerobot_msdyn.reconstruct.self_check import (
+    Witness,
+    decibels,
+    flicker,
+    sharpness,
+    similarity,
+    stands_still,
+    unsteadiness,
+)
+from lerobot_msdyn.synthetic import make_scene
+from lerobot_msdyn.views.expected_error import expected_error
+from lerobot_msdyn.views.gate import Scores, judge, reasons, record
+from lerobot_msdyn.views.perturbation import orbit_offset
+from lerobot_msdyn.views.pictures import Reconstruction
+
+FRAMES, WIDTH, HEIGHT = 30, 64, 48
+
+
+@pytest.fixture(scope="module")
+def pushed() -> View:
+    scene = make_scene("push", 0, FRAMES, WIDTH, HEIGHT)
+    seen = scene.render(scene.camera)
+    return View(seen.rgb, scene.camera, seen.depth)
+
+
+def fitted(view: View, steps: int) -> Reconstruction:
+    recipe = Recipe()
+    recipe.fit.steps = steps
+    return reconstruct(view, recipe)
+
+
+@pytest.fixture(scope="module")
+def scene(pushed: View) -> Reconstruction:
+    return fitted(pushed, 40)
+
+
+def turned(camera: CameraTrack, degrees: float, distance: float) -> CameraTrack:
+    offset = orbit_offset(float(degrees), 0.0, distance)
+    return dataclasses.replace(camera, world_from_camera=camera.world_from_camera @ offset)
+
+
+def score(scene: Reconstruction, degrees: float) -> Scores:
+    return judge(scene.windows, turned(scene.camera, degrees, scene.distance))
+
+
+def test_witnesses_are_frames_that_were_not_fitted(scene: Reconstruction) -> None:
+    witness = scene.witnesses[0]
+    assert witness.held_out
+    assert witness.frames.tolist() == scene.results[0].held_out.tolist()
+    assert len(witness.frames) == 3
+    assert 15 < decibels(float(witness.fitted_error.mean())) < 50
+    assert witness.error.mean() < witness.fitted_error.mean(), "new views are drawn with the overlay"
+    assert witness.moving_error > witness.fitted_error.mean()
+    assert witness.depth_error == pytest.approx(0.01, abs=0.002)
+    assert 0 < witness.track_px < GateConfig().max_track_px
+
+
+def test_short_videos_have_witnesses_too(pushed: View) -> None:
+    assert pushed.depth is not None
+    for frames in (1, 2, 7):
+        short = View(pushed.rgb[:frames], pushed.camera.select(slice(0, frames)), pushed.depth[:frames])
+        scores = score(fitted(short, 2), 5)
+        assert not scores.held_out
+        assert 1 <= len(scores.frames) <= 3
+        assert scores.expected_db > 5
+
+
+def test_farther_cameras_are_expected_to_be_worse(scene: Reconstruction) -> None:
+    found = [score(scene, degrees) for degrees in (0, 5, 15, 30)]
+    expected = [scores.expected_db for scores in found]
+    assert expected == sorted(expected, reverse=True)
+    angles = [scores.angle_deg for scores in found]
+    assert angles == sorted(angles)
+    assert angles[0] < 0.5
+    assert found[0].unseen < found[3].unseen
+
+
+def test_a_scene_that_was_hardly_fitted_is_expected_to_be_worse(pushed: View, scene: Reconstruction) -> None:
+    assert score(fitted(pushed, 1), 5).expected_db < score(scene, 5).expected_db - 0.5
+
+
+def test_depth_that_disagrees_with_the_scene_is_expected_to_be_worse(scene: Reconstruction) -> None:
+    witness = scene.witnesses[0]
+    new = turned(witness.camera, 15, scene.distance)
+    wrong = dataclasses.replace(witness, depth=witness.depth * 1.2)
+    assert expected_error(wrong, new).geometry.mean() > 2 * expected_error(witness, new).geometry.mean()
+    rough = dataclasses.replace(witness, depth_error=0.1)
+    assert expected_error(rough, new).depth.mean() > 3 * expected_error(witness, new).depth.mean()
+
+
+def test_depth_that_is_not_steady_is_known_to_be_wrong() -> None:
+    generator = torch.Generator().manual_seed(0)
+    instances = torch.zeros(20, 12, 16, dtype=torch.uint8)
+    instances[:, :4] = 1  # what moves has many depths
+    depth = torch.full((20, 12, 16), 0.8)
+    depth[:, :4] = torch.rand(20, 4, 16, generator=generator) + 0.5
+    nothing = torch.zeros(0, 20)
+    tracks = PointTracks(torch.zeros(0, 20, 2), nothing.bool(), nothing, torch.zeros(0).long())
+    steady = Priors(depth, instances, tracks, metric=True)
+    assert unsteadiness(steady) == pytest.approx(0, abs=1e-6)
+    noise = torch.exp(0.03 * torch.randn(20, 1, 1, generator=generator))
+    assert unsteadiness(dataclasses.replace(steady, depth=depth * noise)) == pytest.approx(0.03, rel=0.4)
+    assert unsteadiness(dataclasses.replace(steady, depth=torch.zeros_like(depth))) == 0
+
+
+def test_unknown_depth_is_nothing_to_disagree_with(scene: Reconstruction) -> None:
+    witness = scene.witnesses[0]
+    unknown = dataclasses.replace(witness, depth=torch.zeros_like(witness.depth))
+    found = expected_error(unknown, turned(witness.camera, 15, scene.distance))
+    assert found.geometry.tolist() == pytest.approx([0.0, 0.0, 0.0], abs=1e-9)
+    assert torch.isfinite(found.total).all()
+
+
+def test_errors_by_cause_add_up(scene: Reconstruction) -> None:
+    witness: Witness = scene.witnesses[0]
+    found = expected_error(witness, turned(witness.camera, 8, scene.distance))
+    assert sum(found.shares.values()) == pytest.approx(1, abs=1e-5)
+    assert found.psnr_db == pytest.approx(decibels(float(found.total.mean())))
+
+
+def test_what_stands_still_does_not_flicker_more_than_in_the_video(scene: Reconstruction) -> None:
+    assert score(scene, 5).flicker_ratio <= 1
+
+
+def test_measures() -> None:
+    pictures = torch.rand(2, 24, 32, 3, generator=torch.Generator().manual_seed(0))
+    assert similarity(pictures, pictures) == pytest.approx(1, abs=1e-4)
+    assert similarity(pictures, 1 - pictures) < 0.2
+    assert sharpness(pictures) > 10 * sharpness(0.1 * pictures)
+    moving = torch.zeros(1, 9, 9, dtype=torch.bool)
+    moving[0, 4, 4] = True
+    assert stands_still(moving).sum() == 81 - 25
+    assert flicker(pictures, pictures + 0.1, torch.ones(2, 24, 32, dtype=torch.bool)) == pytest.approx(0.1)
+    assert flicker(pictures, pictures + 0.1, torch.zeros(2, 24, 32, dtype=torch.bool)) == 0
+    assert decibels(0.01) == pytest.approx(20)
+
+
+def test_the_verdict_says_why(scene: Reconstruction) -> None:
+    scores = score(scene, 10)
+    assert reasons(scores, GateConfig()) == []
+    for limit, word in (
+        ({"min_expected_db": 60.0}, "gate.min_expected_db 60"),
+        ({"max_track_px": 0.0}, "gate.max_track_px 0"),
+        ({"max_flicker_ratio": 0.0}, "gate.max_flicker_ratio 0"),
+        ({"min_sharpness_ratio": 9.0}, "gate.min_sharpness_ratio 9"),
+    ):
+        (reason,) = reasons(scores, dataclasses.replace(GateConfig(), **limit))
+        assert word in reason
+        assert "\n" not in reason
+
+
+def test_the_record_holds_plain_values(scene: Reconstruction) -> None:
+    found = record(score(scene, 10))
+    assert [frame["frame"] for frame in found["frames"]] == scene.witnesses[0].frames.tolist()
+    assert len(found["heat"]) == 18
+    assert all(0 <= value <= 100 for row in found["heat"] for value in row)
+    assert set(found["causes"]) == {"video", "geometry", "depth", "sampling"}
