@@ -42,15 +42,11 @@ from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.files import write_whole
 from lerobot_msdyn.evaluate.metrics import masked_psnr_db
 from lerobot_msdyn.priors import Priors, estimate_priors
-from lerobot_msdyn.reconstruct.background import EmptyScene, empty_scene
-from lerobot_msdyn.reconstruct.fit import fit
-from lerobot_msdyn.reconstruct.initialise import initialise
-from lerobot_msdyn.reconstruct.make_overlay import unexplained
-from lerobot_msdyn.reconstruct.share_background import NEAR
+from lerobot_msdyn.reconstruction.fit import fit
+from lerobot_msdyn.reconstruction.reconstruct import Draft, reconstruct, with_steps
+from lerobot_msdyn.reconstruction.result import Reconstruction
 from lerobot_msdyn.render.cpu.threads import torch_on_one_thread
-from lerobot_msdyn.views.coverage import evidence_of
-from lerobot_msdyn.views.perturbation import look_at_distance
-from lerobot_msdyn.views.pictures import Reconstruction, new_pictures
+from lerobot_msdyn.views.pictures import new_pictures
 
 JSON = Path(__file__).with_suffix(".json")
 PLOT = Path(__file__).parent.parent / "docs" / "images" / "ablation.svg"
@@ -135,22 +131,32 @@ def prepared(case: Case) -> Prepared:
 
 
 def reconstructed(known: Prepared, row: Row, recipe: Recipe) -> Reconstruction:
-    """A row's scene: `pipeline.reconstruct` on given priors, with motion that is learned where the row says so."""
-    view, priors = known.case.view, known.priors
-    distance = look_at_distance(known.empty.depth)
-    scene = initialise(view, priors, recipe.scene, recipe.motion, known.empty)
-    scene, learned = replace(scene, near=NEAR * distance), []
-    if row.learned:
-        scene, learned = with_learned_motion(scene, distance, afresh=row.learned == "afresh")
-    result = fit(
-        scene, view, priors, recipe.fit, empty=known.empty.rgb, distance=distance, seed=recipe.seed, learned=learned
-    )
-    result = replace(result, scene=with_fixed_motion(result.scene))
-    evidence = evidence_of(result.scene, view.camera, known.empty)
-    if recipe.scene.overlay:
-        overlay = unexplained(result.scene, view, priors)
-        result = replace(result, scene=replace(result.scene, overlay=overlay))
-    return Reconstruction((result,), (0,), priors.metric, {}, view.camera, distance, (evidence,), ())
+    """A row's scene: the package's own steps on given priors, with motion that is learned where the row says so."""
+
+    def given_priors(draft: Draft) -> None:
+        draft.priors = known.priors
+
+    def given_background(draft: Draft) -> None:
+        draft.empty, draft.distance = known.empty, look_at_distance(known.empty.depth)
+
+    def fitted(draft: Draft) -> None:
+        scene, learned = draft.scene, []
+        if row.learned:
+            scene, learned = with_learned_motion(scene, draft.distance, afresh=row.learned == "afresh")
+        draft.fitted = fit(
+            scene,
+            draft.view,
+            draft.priors,
+            recipe.fit,
+            empty=draft.empty.rgb,
+            distance=draft.distance,
+            seed=recipe.seed,
+            learned=learned,
+        )
+        draft.scene = with_fixed_motion(draft.fitted.scene)
+
+    steps = with_steps({"priors": given_priors, "background": given_background, "fit": fitted})
+    return reconstruct(known.case.view, recipe, steps=steps)
 
 
 def pictures(known: Prepared, row: Row, settings: Settings) -> Iterator[tuple[HeldOut, list[UInt8[ndarray, "h w 3"]]]]:

@@ -17,7 +17,7 @@ from lerobot_msdyn.core.geometry import project, transform_points, unproject_ima
 from lerobot_msdyn.motion.field import DeformationField
 from lerobot_msdyn.motion.model.bases import MotionLevel
 from lerobot_msdyn.priors import Priors
-from lerobot_msdyn.reconstruct.background import EmptyScene
+from lerobot_msdyn.reconstruction.background import EmptyScene
 from lerobot_msdyn.scene.gaussians import DynamicScene
 
 FIELD_RATE = 1e-3  # of a deformation field's layers

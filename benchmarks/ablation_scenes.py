@@ -13,7 +13,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.priors import PointTracks
 from lerobot_msdyn.synthetic import SyntheticScene, covisibility, heldout_cameras, make_scene
 

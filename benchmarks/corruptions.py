@@ -11,7 +11,8 @@ from numpy import ndarray
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.config import Recipe
-from lerobot_msdyn.dataset.read import View, open_source, read_episode, select_cameras, shrink
+from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.dataset.read import open_source, read_episode, select_cameras
 from lerobot_msdyn.priors import Priors, estimate_priors
 from lerobot_msdyn.priors.exchange import from_priors, write_exchange
 
@@ -40,9 +41,8 @@ def read_clip(folder: Path, stride: int, width: int) -> View:
         poses = torch.from_numpy(truth["c2w"]).float()
         intrinsics = torch.from_numpy(truth["K"]).float().expand(len(poses), 3, 3).contiguous()
     every = slice(0, None, stride)
-    camera = CameraTrack(intrinsics, poses, view.camera.width, view.camera.height).select(every)
-    depth = None if view.depth is None else view.depth[every]
-    return shrink(View(view.rgb[every], camera, depth, view.depth_range), width)
+    camera = CameraTrack(intrinsics, poses, view.camera.width, view.camera.height)
+    return replace(view, camera=camera).select(every).shrunk(width)
 
 
 def corrupted(view: View, recipe: Recipe, corruption: str, priors: Priors, folder: Path) -> Case:

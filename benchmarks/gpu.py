@@ -25,20 +25,17 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
-from unittest import mock
 
 import torch
 from rasterizer import Workload, make_workload
 
 from lerobot_msdyn.augment import __main__ as augment
+from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.core.cli import parse_config
-from lerobot_msdyn.core.config import AugmentConfig
-from lerobot_msdyn.dataset.read import View, open_source, read_episode
-from lerobot_msdyn.reconstruct import reconstruct as pipeline
-from lerobot_msdyn.reconstruct.fit import FitResult, fit
-from lerobot_msdyn.reconstruct.reconstruct import reconstruct
-from lerobot_msdyn.reconstruct.self_check import decibels
+from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.dataset.read import open_source, read_episode
+from lerobot_msdyn.reconstruction.reconstruct import STEPS, Draft, reconstruct, with_steps
+from lerobot_msdyn.reconstruction.self_check import decibels
 from lerobot_msdyn.render.devices import chosen_device
 from lerobot_msdyn.scene.draw import render_frames
 from lerobot_msdyn.synthetic import make_scene
@@ -178,9 +175,13 @@ def psnr(target: Device, options: argparse.Namespace) -> Iterator[dict]:
     for device in ("cpu", target.backend):
         config = _config(options, device)
         scene = reconstruct(View(seen.rgb, video.camera, seen.depth), config)
-        found[device] = decibels(float(scene.witnesses[0].fitted_error.mean()))
-        steps = scene.results[0].steps
-        yield {"case": f"fit on {device}", "held-out dB": found[device], "ms per step": 1e3 * scene.seconds / steps}
+        found[device] = decibels(float(scene.windows[0].self_check.fitted_error.mean()))
+        steps = scene.windows[0].fit_steps
+        yield {
+            "case": f"fit on {device}",
+            "held-out dB": found[device],
+            "ms per step": 1e3 * scene.seconds["fit"] / steps,
+        }
     yield {"case": "difference", "held-out dB": found[target.backend] - found["cpu"]}
 
 
@@ -197,7 +198,7 @@ def episode(target: Device, options: argparse.Namespace, folder: Path) -> Iterat
     row = {"case": "its fit"}
     with target.peak_mb(row):
         scene = reconstruct(view, config)
-    row |= {"fit s": scene.seconds, "ms per step": 1e3 * scene.seconds / scene.results[0].steps}
+    row |= {"fit s": scene.seconds["fit"], "ms per step": 1e3 * scene.seconds["fit"] / scene.windows[0].fit_steps}
     if target.is_cuda:
         row["outside kernels"] = 1 - _fit_kernel_ms(target, view, config) / row["ms per step"]
     yield row
@@ -206,7 +207,7 @@ def episode(target: Device, options: argparse.Namespace, folder: Path) -> Iterat
     row = {"case": "drawing through a new camera"}
     with target.peak_mb(row):
         for name, call in (
-            ("frames per s, drawn alone", lambda: list(render_frames(drawn.results[0].scene, camera))),
+            ("frames per s, drawn alone", lambda: list(render_frames(drawn.windows[0].scene, camera))),
             ("frames per s, holes filled, on the host", lambda: list(new_pictures(drawn, camera))),
         ):
             row[name] = 1e3 * len(camera) / target.ms(call, runs=3)
@@ -218,13 +219,10 @@ def _fit_kernel_ms(target: Device, view: View, config: AugmentConfig, steps: int
     short = replace(config, fit=replace(config.fit, steps=steps, moving_gain_from=1.0, held_out_frames=0))
     found = []
 
-    def profiled(*arguments: Any, **named: Any) -> FitResult:
-        results: list[FitResult] = []
-        found.append(target.kernel_ms(lambda: results.append(fit(*arguments, **named))))
-        return results[0]
+    def profiled(draft: Draft) -> None:
+        found.append(target.kernel_ms(lambda: STEPS["fit"](draft)))
 
-    with mock.patch.object(pipeline, "fit", profiled):
-        reconstruct(view, short)
+    reconstruct(view, short, steps=with_steps({"fit": profiled}))
     return found[0] / steps
 
 

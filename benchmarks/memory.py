@@ -24,10 +24,9 @@ from pathlib import Path
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 
 # Imported once: every process is forked from this one, so that the imports are the same share of all figures.
-from lerobot_msdyn.augment.report import build  # noqa: F401
-
 from lerobot_msdyn.augment import __main__ as augment
 from lerobot_msdyn.augment import run_identity as identity  # noqa: F401
+from lerobot_msdyn.augment.report import build  # noqa: F401
 from lerobot_msdyn.core.cli import run_command
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.dataset import write_dataset

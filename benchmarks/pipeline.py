@@ -26,7 +26,7 @@ from dataclasses import asdict, dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-STAGES = ("shared background", "read", "priors", "initial scene", "fit", "render")
+STAGES = ("shared background", "read", "priors", "initial scene", "fit", "render")  # further steps are left out
 BASELINE = Path(__file__).with_suffix(".json")
 SLACK = 1.3  # a figure may grow by so many times what it grows by in the baseline
 LEAST_S = 0.5  # of processor time in the base case, from which a stage is judged
@@ -76,16 +76,16 @@ def timed(function: Callable, name: str, seconds: dict[str, float]) -> Callable:
 
 def measure(case: Case, recipe_name: str, steps: int | None, pipe: Connection) -> None:
     """Send the seconds and processor seconds of every stage, and the peak of resident memory (MB)."""
+    from lerobot_msdyn.augment.backgrounds import shared_backgrounds
+    from lerobot_msdyn.augment.config import AugmentConfig
     from lerobot_msdyn.core.cli import parse_config
-    from lerobot_msdyn.core.config import AugmentConfig
-    from lerobot_msdyn.dataset.read import open_source
-    from lerobot_msdyn.reconstruct import reconstruct as pipeline
-    from lerobot_msdyn.reconstruct.share_background import shared_backgrounds
+    from lerobot_msdyn.dataset.read import open_source, read_episode
+    from lerobot_msdyn.reconstruction.reconstruct import STEPS, reconstruct
     from lerobot_msdyn.render.warmup import warm_up
     from lerobot_msdyn.synthetic import make_scene
     from lerobot_msdyn.synthetic.dataset import write_dataset
     from lerobot_msdyn.views.new_cameras import new_cameras
-    from lerobot_msdyn.views.pictures import pictures as views
+    from lerobot_msdyn.views.pictures import new_pictures
 
     seconds: dict[str, float] = defaultdict(float)
 
@@ -102,15 +102,13 @@ def measure(case: Case, recipe_name: str, steps: int | None, pipe: Connection) -
         source = open_source("local/bench", Path(folder) / "bench")
         key = "observation.images.front"
         share = timed(shared_backgrounds, "shared background", seconds)
-        read = timed(pipeline.read_episode, "read", seconds)
-        render = timed(lambda scene, camera: list(views.new_pictures(scene, camera)), "render", seconds)
+        read = timed(read_episode, "read", seconds)
+        render = timed(lambda scene, camera: list(new_pictures(scene, camera)), "render", seconds)
         backgrounds = share(source, [key], recipe)
-        pipeline.estimate_priors = timed(pipeline.estimate_priors, "priors", seconds)
-        pipeline.initialise = timed(pipeline.initialise, "initial scene", seconds)
-        pipeline.fit = timed(pipeline.fit, "fit", seconds)
+        steps = {name: timed(step, name, seconds) for name, step in STEPS.items()}
         for index in range(case.episodes):
             view = read(source, index, [key], recipe.camera).views[key]
-            scene = pipeline.reconstruct(view, recipe, backgrounds=backgrounds.get(key, []))
+            scene = reconstruct(view, recipe, backgrounds=backgrounds.get(key, []), steps=steps)
             for variant in range(case.variants):
                 render(scene, new_cameras({key: scene}, recipe, index, variant).cameras[key])
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)

@@ -43,12 +43,12 @@ from numpy import ndarray
 
 from lerobot_msdyn.core.config import CameraConfig, PriorsConfig, Recipe
 from lerobot_msdyn.core.geometry import quaternion_to_matrix
-from lerobot_msdyn.dataset.read import View, open_source, read_episode, select_cameras
+from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.dataset.read import open_source, read_episode, select_cameras
 from lerobot_msdyn.priors import PointTracks, estimate_priors
 from lerobot_msdyn.priors.depth.table_plane import table_plane_depth
 from lerobot_msdyn.priors.masks.moving import moving_instances, temporal_median
 from lerobot_msdyn.priors.tracks.flow import flow_tracks
-from lerobot_msdyn.reconstruct.reconstruct import shrink
 from lerobot_msdyn.synthetic import make_scene
 
 AGES = (30, 60, 90)  # frames
@@ -168,9 +168,8 @@ def measure(folder: Path, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
     source = open_source(f"local/{scene}", folder / scene / "dataset")
     key = select_cameras(source, None)[0]
     episode = int(part.removeprefix("ep") or 0)
-    view = shrink(
-        read_episode(source, episode, [key], recipe.camera, recorded_depth=False).views[key], recipe.fit.max_width
-    )
+    recorded = read_episode(source, episode, [key], recipe.camera, recorded_depth=False).views[key]
+    view = recorded.shrunk(recipe.fit.max_width)
     if view.rgb.shape[:3] != truth.seg.shape:
         raise SystemExit(f"{name}: the pictures are {tuple(view.rgb.shape[:3])}, the truth {truth.seg.shape}")
     start = time.process_time()

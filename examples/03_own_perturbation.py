@@ -37,7 +37,7 @@ def main() -> None:
     azimuths = np.linspace(-15, 15, arguments.frames)
     offsets = torch.stack([orbit_offset(azimuth, 3.0, scene.distance) for azimuth in azimuths])
     moved = replace(scene.camera, world_from_camera=scene.camera.world_from_camera @ offsets)
-    drawn = torch.cat([part.rgb for part in render_frames(scene.results[0].scene, moved)])
+    drawn = torch.cat([part.rgb for part in render_frames(scene.windows[0].scene, moved)])
     pictures = (255 * drawn.clamp(0, 1)).round().byte().numpy()
     chosen = np.linspace(0, len(pictures) - 1, 4).round().astype(int)
     path = arguments.out / "swing.png"

@@ -40,7 +40,7 @@ def main() -> None:
     view = read_episode(source, 0, [CAMERA], recipe.camera).views[CAMERA]
     scene = reconstruct(view, recipe, episode=0, key=CAMERA)
     print({name: origin["provider"] for name, origin in scene.provenance.items()})
-    print(f"{scene.results[0].train_psnr_db:.1f} dB on the recorded camera")
+    print(f"{scene.windows[0].train_psnr_db:.1f} dB on the recorded camera")
 
 
 if __name__ == "__main__":

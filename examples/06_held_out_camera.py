@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from lerobot_msdyn.core.cli import parse_config
-from lerobot_msdyn.core.config import EvaluateConfig
+from lerobot_msdyn.evaluate.config import EvaluateConfig
 from lerobot_msdyn.evaluate.nvs import evaluate_nvs
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.nvs import write_nvs_folder

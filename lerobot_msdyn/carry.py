@@ -5,11 +5,11 @@ python -m lerobot_msdyn.carry --root MERGED --sources '[FOLDER, FOLDER]'
 
 import logging
 import sys
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lerobot_msdyn.core.cli import EXIT_OK, parse_config, run_command
-from lerobot_msdyn.core.config import CarryConfig
 from lerobot_msdyn.core.errors import ConfigError, DatasetError
 
 if TYPE_CHECKING:
@@ -18,6 +18,17 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 COMMAND = "python -m lerobot_msdyn.carry"
+
+
+@dataclass
+class CarryConfig:
+    """`python -m lerobot_msdyn.carry`: meta/msdyn/ for what LeRobot's tools made of other datasets."""
+
+    # Exact folder of the dataset that gets it.
+    root: Path | None = None
+    # Exact folders of the datasets that it was made from, e.g. '[A, B]'.
+    sources: list[Path] = field(default_factory=list)
+
 
 Mark = tuple[str | None, str]  # digests of an episode's rows and of the statistics of its pictures
 

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lerobot_msdyn.core.cli import EXIT_OK, parse_config, run_command
-from lerobot_msdyn.core.config import SplitConfig
 from lerobot_msdyn.core.errors import ConfigError, DatasetError
 
 if TYPE_CHECKING:
@@ -20,6 +19,18 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 COMMAND = "python -m lerobot_msdyn.split"
+
+
+@dataclass
+class SplitConfig:
+    """`python -m lerobot_msdyn.split`: flags for lerobot-train that hold out whole recordings."""
+
+    # Exact folder of the dataset.
+    root: Path | None = None
+    # Share of each task's recordings that is held out.
+    eval_split: float = 0.2
+
+
 DIGITS = 6  # of the share that is passed to LeRobot
 
 

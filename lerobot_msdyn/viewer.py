@@ -5,26 +5,45 @@ python -m lerobot_msdyn.viewer --repo local/ds --episode 0 [--scenes FOLDER] [--
 
 import logging
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lerobot_msdyn.core.cli import EXIT_OK, parse_config, run_command
-from lerobot_msdyn.core.config import ViewerConfig
+from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import ConfigError, DatasetError, MsdynError, OutputError
 
 if TYPE_CHECKING:
     import rerun as rr
 
     from lerobot_msdyn.core.cameras import CameraTrack
-    from lerobot_msdyn.dataset.read import View
+    from lerobot_msdyn.core.observations import View
     from lerobot_msdyn.priors import Priors
     from lerobot_msdyn.scene.store import SavedScene
 
 logger = logging.getLogger(__name__)
 
 COMMAND = "python -m lerobot_msdyn.viewer"
+
+
+@dataclass
+class ViewerConfig(Recipe):
+    """`python -m lerobot_msdyn.viewer`: look at an episode, its scene and its new views in Rerun."""
+
+    # Source dataset (alias: --repo).
+    repo_id: str = ""
+    # Exact folder of the source dataset; default: LeRobot's home, then the hub.
+    root: Path | None = None
+    # The episode to show.
+    episode: int = 0
+    # Output folder of `augment --save_scenes true`; without it the episode is fitted first.
+    scenes: Path | None = None
+    # A .rrd file to write instead of opening a window.
+    save: Path | None = None
+
+
 ALIASES = {"repo": "repo_id"}
 FRUSTUM_SHARE = 0.15  # length of a drawn frustum, of the look-at distance
 GOLDEN = 0.618034  # of the circle of hues, from one index to the next
@@ -61,7 +80,7 @@ def show_episode(config: ViewerConfig, stream: "rr.RecordingStream") -> None:
     Raises:
         DatasetError: there is no such dataset or episode, or the scenes hold none of it.
     """
-    from lerobot_msdyn.dataset.read import open_source, read_episode, select_cameras, select_episodes, shrink
+    from lerobot_msdyn.dataset.read import open_source, read_episode, select_cameras, select_episodes
     from lerobot_msdyn.priors import estimate_priors
     from lerobot_msdyn.scene import store as saved
 
@@ -74,7 +93,7 @@ def show_episode(config: ViewerConfig, stream: "rr.RecordingStream") -> None:
         if not cameras:
             raise DatasetError(f"{config.scenes}: no saved scene of episode {index} of {source.repo_id}")
     episode = read_episode(source, index, cameras, config.camera, recorded_depth=config.priors.depth != "plane")
-    small = {key: shrink(view, config.fit.max_width) for key, view in episode.views.items()}
+    small = {key: view.shrunk(config.fit.max_width) for key, view in episode.views.items()}
     for key, view in episode.views.items():
         others = [other for name, other in small.items() if name != key]
         priors = estimate_priors(
@@ -92,13 +111,13 @@ def show_episode(config: ViewerConfig, stream: "rr.RecordingStream") -> None:
 
 def _reconstructed(config: ViewerConfig, source: Any, index: int, key: str, views: dict[str, "View"]) -> "SavedScene":
     """The scene of a camera, fitted now."""
-    from lerobot_msdyn.reconstruct.reconstruct import reconstruct, to_saved
+    from lerobot_msdyn.reconstruction.reconstruct import reconstruct
     from lerobot_msdyn.scene.store import SceneSource
 
     others = [other for name, other in views.items() if name != key]
     logger.info("fitting %s; saved scenes are shown at once (--scenes)", key)
     found = reconstruct(views[key], config, others=others, episode=index, key=key)
-    return to_saved(found, SceneSource(source.repo_id, index, key, source.fps))
+    return found.saved(SceneSource(source.repo_id, index, key, source.fps))
 
 
 class _Log:

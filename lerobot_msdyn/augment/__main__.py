@@ -9,8 +9,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.core.cli import EXIT_INTERRUPTED, EXIT_OK, EXIT_SOME_EPISODES_FAILED, parse_config, run_command
-from lerobot_msdyn.core.config import AugmentConfig
 from lerobot_msdyn.core.errors import ConfigError, EpisodeError
 
 if TYPE_CHECKING:
@@ -97,12 +97,12 @@ def augment(
     staging: "Staging",
 ) -> int:
     """Run the job that the command line described and say how it went; returns the exit code."""
+    from lerobot_msdyn.augment.backgrounds import background_episodes
     from lerobot_msdyn.augment.report.build import write_report
     from lerobot_msdyn.augment.run import run_local
     from lerobot_msdyn.augment.run_identity import describe_run, recipe_text, source_files
     from lerobot_msdyn.dataset.provenance import SOURCE_VARIANT
     from lerobot_msdyn.dataset.write import OutputDataset
-    from lerobot_msdyn.reconstruct.share_background import background_episodes
     from lerobot_msdyn.views.perturbation import units_of_shifts
 
     start = time.perf_counter()

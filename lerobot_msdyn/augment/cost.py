@@ -8,11 +8,13 @@ from pathlib import Path
 
 from lerobot.datasets import LeRobotDatasetMetadata
 
+from lerobot_msdyn.augment.backgrounds import looked_at
+from lerobot_msdyn.augment.episode import by_feature
 from lerobot_msdyn.core.config import Recipe
+from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.dataset.encode import stage_pictures
-from lerobot_msdyn.dataset.read import View, read_episode
-from lerobot_msdyn.reconstruct.reconstruct import FURTHER_STEPS, by_feature, reconstruct
-from lerobot_msdyn.reconstruct.share_background import looked_at
+from lerobot_msdyn.dataset.read import read_episode
+from lerobot_msdyn.reconstruction.reconstruct import FURTHER_STEPS, reconstruct
 from lerobot_msdyn.render.devices import chosen_device
 from lerobot_msdyn.scene.gaussians import DynamicScene
 from lerobot_msdyn.views.pictures import new_pictures, on_device
@@ -65,12 +67,12 @@ def measure_speeds(source: LeRobotDatasetMetadata, index: int, cameras: list[str
         start = time.perf_counter()
         others = [other for name, other in views.items() if name != key]
         scene = reconstruct(part, short, tick, others=others, episode=index, key=key)
-        prepare_s += (time.perf_counter() - start - scene.seconds) / len(part.rgb)
+        prepare_s += (time.perf_counter() - start - scene.seconds["fit"]) / len(part.rgb)
         steps = [
             after - before for before, after in zip(ticks[WARM_UP_STEPS:], ticks[WARM_UP_STEPS + 1 :], strict=False)
         ]
         step_s += statistics.median(steps)
-        once, each = _saved_sizes(scene.results[0].scene)
+        once, each = _saved_sizes(scene.windows[0].scene)
         scene_bytes, frame_bytes = scene_bytes + once, frame_bytes + each
         with tempfile.TemporaryDirectory() as folder:
             start = time.perf_counter()
@@ -117,7 +119,5 @@ def _saved_sizes(scene: DynamicScene) -> tuple[float, float]:
 
 
 def _middle(view: View) -> View:
-    start = max(0, (len(view.rgb) - PROBE_FRAMES) // 2)
-    part = slice(start, start + PROBE_FRAMES)
-    depth = None if view.depth is None else view.depth[part]
-    return View(view.rgb[part], view.camera.select(part), depth, view.depth_range)
+    start = max(0, (len(view) - PROBE_FRAMES) // 2)
+    return view.select(slice(start, start + PROBE_FRAMES))

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import DatasetError, EpisodeError
+from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.dataset.read import Episode, read_episode
 from lerobot_msdyn.priors.camera.steadiness import SWAY_PX, camera_motion_px
 
@@ -65,7 +66,7 @@ def correlation(state: Float[Tensor, "t s"], rgb: UInt8[Tensor, "t h w 3"]) -> f
     pairs = min(len(rgb) - 1, 60)
     if pairs < MIN_PAIRS:
         return 0.0
-    frames = np.linspace(0, len(rgb) - 1, pairs + 1).round().astype(int)
+    frames = evenly(len(rgb), pairs + 1).numpy()
     spread = state.std(0).clamp(min=1e-6)
     speed = (state[frames[1:]] - state[frames[:-1]]).div(spread).norm(dim=1).numpy()
     small = [_small(rgb[int(frame)]) for frame in frames]

@@ -12,14 +12,14 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
+from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.augment.cost import measure_speeds, predicted_scene_bytes, predicted_seconds
+from lerobot_msdyn.augment.episode import augment_episode
 from lerobot_msdyn.augment.workers import Work, Workers, threads_of_one, workers_for
-from lerobot_msdyn.core.config import AugmentConfig
 from lerobot_msdyn.core.errors import EpisodeError, MsdynError
 from lerobot_msdyn.dataset.read import depth_key_of
 from lerobot_msdyn.dataset.video import quiet_encoders
 from lerobot_msdyn.dataset.write import NewEpisode, OutputDataset
-from lerobot_msdyn.reconstruct.reconstruct import augment_episode
 from lerobot_msdyn.render.devices import chosen_device
 
 logger = logging.getLogger(__name__)

@@ -12,7 +12,8 @@ import draccus
 import yaml
 from lerobot.datasets import LeRobotDatasetMetadata
 
-from lerobot_msdyn.core.config import AugmentConfig, Recipe
+from lerobot_msdyn.augment.config import AugmentConfig
+from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.files import DIGEST_BYTES, digest_of_file
 from lerobot_msdyn.dataset.checks import place_problem
 from lerobot_msdyn.render.devices import chosen_device

@@ -27,14 +27,14 @@ import torch
 from lerobot.datasets import LeRobotDatasetMetadata
 from tqdm import tqdm
 
-from lerobot_msdyn.core.config import AugmentConfig
+from lerobot_msdyn.augment.backgrounds import Backgrounds, MaskTask, Run, shared_backgrounds
+from lerobot_msdyn.augment.config import AugmentConfig
+from lerobot_msdyn.augment.episode import Progress
 from lerobot_msdyn.core.errors import WorkerError
 from lerobot_msdyn.dataset.read import open_source
 from lerobot_msdyn.dataset.staging import Staging
 from lerobot_msdyn.dataset.video import quiet_encoders
 from lerobot_msdyn.dataset.write import OutputDataset
-from lerobot_msdyn.reconstruct.reconstruct import Progress
-from lerobot_msdyn.reconstruct.share_background import Backgrounds, MaskTask, Run, shared_backgrounds
 from lerobot_msdyn.render.devices import chosen_device
 
 MEMORY_EACH = 3e9  # bytes of a machine's memory that there must be for each worker

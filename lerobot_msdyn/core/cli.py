@@ -14,8 +14,10 @@ import draccus
 import yaml
 from draccus.wrappers.docstring import get_attribute_docstring
 
-from lerobot_msdyn.core.config import Recipe, problems
-from lerobot_msdyn.core.errors import ConfigError, MsdynError
+from lerobot_msdyn.core.config import Recipe
+from lerobot_msdyn.core.errors import ConfigError, MsdynError, one_line
+from lerobot_msdyn.core.fields import problems
+from lerobot_msdyn.core.plugins import import_plugins
 
 logger = logging.getLogger(__name__)
 
@@ -56,7 +58,7 @@ def read_recipe(name: str) -> dict[str, Any]:
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f"recipe {path} is not readable YAML: {_one_line(error)}") from error
+        raise ConfigError(f"recipe {path} is not readable YAML: {one_line(error)}") from error
     if not isinstance(content, dict | None):
         raise ConfigError(f"recipe {path} holds a {type(content).__name__}; expected a mapping of fields")
     return content or {}
@@ -82,7 +84,8 @@ def parse_config[T](config_class: type[T], arguments: list[str], aliases: Mappin
     if "-h" in arguments or "--help" in arguments:
         sys.stdout.write(format_help(config_class, aliases, command))
         sys.exit(EXIT_OK)
-    recipe, overrides = _split_flags(arguments, aliases)
+    recipe, plugins, overrides = _split_flags(arguments, aliases)
+    import_plugins(plugins)
     content: dict[str, Any] = draccus.encode(config_class())
     for part in ([read_recipe(recipe)] if recipe is not None else []) + [overrides]:
         unknown = _unknown_fields(config_class, _merge(content, part), part)
@@ -93,7 +96,7 @@ def parse_config[T](config_class: type[T], arguments: list[str], aliases: Mappin
     try:
         config = draccus.decode(config_class, content)
     except (draccus.utils.DraccusException, TypeError, ValueError, AttributeError) as error:
-        raise ConfigError(_one_line(error)) from error
+        raise ConfigError(one_line(error)) from error
     found = problems(config)
     if found:
         raise ConfigError("; ".join(found))
@@ -107,7 +110,8 @@ def format_help(config_class: type, aliases: Mapping[str, str], command: str) ->
     head = (
         f"usage: {command} [--field value ...]\n\n{inspect.getdoc(config_class)}\n\n"
         f"  --recipe NAME_OR_FILE\n      A YAML file with any of the fields below, read before the flags; "
-        f"by name: {recipes}.\n\nShort names: {names}.\n"
+        f"by name: {recipes}.\n  --plugins MODULE_OR_FILE.py\n      Your own providers, motion levels, perturbations "
+        f"or loss terms, imported before the recipe is read (docs/extending.md).\n\nShort names: {names}.\n"
     )
     return head + "".join(_help_lines(config_class, ""))
 
@@ -141,7 +145,7 @@ def run_command(main: Callable[[list[str]], int], arguments: list[str] | None = 
     try:
         code = main(sys.argv[1:] if arguments is None else arguments)
     except MsdynError as error:
-        sys.stderr.write(f"error: {_one_line(error)}\n")
+        sys.stderr.write(f"error: {one_line(error)}\n")
         code = EXIT_BAD_INPUT
     except KeyboardInterrupt:
         sys.stderr.write("interrupted: nothing was written\n")
@@ -149,13 +153,10 @@ def run_command(main: Callable[[list[str]], int], arguments: list[str] | None = 
     sys.exit(code)
 
 
-def _one_line(error: object) -> str:
-    return " ".join(str(error).split())
-
-
-def _split_flags(arguments: list[str], aliases: Mapping[str, str]) -> tuple[str | None, dict[str, Any]]:
-    """The recipe's name, and the other flags as nested fields; values are read as YAML scalars or lists."""
+def _split_flags(arguments: list[str], aliases: Mapping[str, str]) -> tuple[str | None, list[str], dict[str, Any]]:
+    """The recipe's name, the plugins, and the other flags as nested fields; values are YAML scalars or lists."""
     recipe = None
+    plugins: list[str] = []
     overrides: dict[str, Any] = {}
     rest = list(arguments)
     while rest:
@@ -171,7 +172,10 @@ def _split_flags(arguments: list[str], aliases: Mapping[str, str]) -> tuple[str 
         try:
             value = yaml.safe_load(text) if text else text
         except yaml.YAMLError as error:
-            raise ConfigError(f"--{name}: {text!r} is not a YAML value: {_one_line(error)}") from error
+            raise ConfigError(f"--{name}: {text!r} is not a YAML value: {one_line(error)}") from error
+        if name == "plugins":
+            plugins += [str(item) for item in (value if isinstance(value, list) else [value])]
+            continue
         target = overrides
         *parents, leaf = aliases.get(name, name).split(".")
         for parent in parents:
@@ -179,7 +183,7 @@ def _split_flags(arguments: list[str], aliases: Mapping[str, str]) -> tuple[str 
             if not isinstance(target, dict):
                 raise ConfigError(f"--{name}: {parent!r} was given a value already")
         target[leaf] = value
-    return recipe, overrides
+    return recipe, plugins, overrides
 
 
 def _merge(base: dict[str, Any], part: dict[str, Any]) -> dict[str, Any]:
@@ -207,6 +211,8 @@ def _unknown_fields(config_class: type, merged: dict[str, Any], part: dict[str, 
             lines.append(f"unknown field {prefix + str(key)!r}{hint}")
             continue
         field_class = hints[key]
+        if typing.get_origin(field_class) is dict and not isinstance(value, dict):
+            lines.append(f"{prefix + key!r} is {value!r}; expected a mapping")
         if not dataclasses.is_dataclass(field_class):
             if field_class is str and isinstance(value, list | dict):
                 lines.append(f"{prefix + key!r} is {value!r}; expected text")

@@ -43,3 +43,14 @@ class RenderError(MsdynError):
 
 class WorkerError(MsdynError):
     """A process that worked on episodes ended unexpectedly."""
+
+
+def one_line(error: object) -> str:
+    """A text or an error in one line."""
+    return " ".join(str(error).split())
+
+
+def first_line(error: BaseException) -> str:
+    """The kind of an error of a library, and the first line of what it says."""
+    text = str(error).strip()
+    return f"{type(error).__name__}: {text.splitlines()[0]}" if text else type(error).__name__

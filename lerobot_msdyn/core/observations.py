@@ -1,16 +1,29 @@
-"""What the priors hand to the reconstruction: depth, instances, point tracks and the camera of one video."""
+"""What one camera recorded, and what its priors say of it: depth, instances, point tracks and the camera itself."""
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 
+import cv2
+import numpy as np
+import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.priors.hub import LocalModel
 
-# Relative error of depth that cannot be seen in the video, by the provider of depth; others: OTHER_DEPTH_ERROR.
-DEPTH_ERROR = {"recorded": 0.01, "stereo": 0.02, "plane": 0.10}
-OTHER_DEPTH_ERROR = 0.05
+
+@dataclass(frozen=True)
+class DepthTraits:
+    """What can be relied on in depth, as its provider says."""
+
+    metric: bool = False  # in true metres (a sensor or a calibration), not only plausible
+    sharp: bool = False  # edges stand where those of the picture do, and frames agree with each other
+    relative_error: float = 0.05  # that cannot be seen in the video
+    assumed: bool = False  # nobody has looked: it contradicts no picture
+
+    @property
+    def measured(self) -> bool:
+        """Whether it can tell which of two surfaces a point belongs to."""
+        return self.sharp and not self.assumed
 
 
 @dataclass(frozen=True)
@@ -22,11 +35,6 @@ class Origin:
     model: str = ""  # empty where nothing learned is involved
     revision: str = ""
     licence: str = ""
-
-    @classmethod
-    def learned(cls, provider: str, model: LocalModel, why: str) -> "Origin":
-        """That of a learned model."""
-        return cls(provider, why, model.name, model.revision, model.licence)
 
     @property
     def line(self) -> str:
@@ -59,11 +67,42 @@ class Priors:
     depth: Float[Tensor, "t h w"]  # m, z-depth; 0 = unknown
     instances: UInt8[Tensor, "t h w"]  # 0 = static background, 1.. = moving instances
     tracks: PointTracks
-    metric: bool  # whether depth is in true metres (a sensor or a calibration) or only plausible
+    depth_traits: DepthTraits = DepthTraits()
     provenance: dict[str, dict[str, str]] = field(default_factory=dict)  # prior -> provider, why, model, licence
     camera: CameraTrack | None = None  # the one to use from here on; None: that of the video
 
     @property
-    def depth_error(self) -> float:
-        """Relative error of depth that its provider is known to make."""
-        return DEPTH_ERROR.get(self.provenance.get("depth", {}).get("provider", ""), OTHER_DEPTH_ERROR)
+    def metric(self) -> bool:
+        """Whether depth is in true metres."""
+        return self.depth_traits.metric
+
+
+@dataclass(frozen=True)
+class View:
+    """What one camera recorded."""
+
+    rgb: UInt8[Tensor, "t h w 3"]
+    camera: CameraTrack
+    depth: Float[Tensor, "t h w"] | None = None  # m, z-depth; as recorded, see `depth_range`
+    depth_range: tuple[float, float] = (0.0, float("inf"))  # m; values at the ends mean "not measured"
+
+    def __len__(self) -> int:
+        return self.rgb.shape[0]
+
+    def select(self, frames: slice | Int[Tensor, " s"]) -> "View":
+        """The video at some of its frames."""
+        depth = None if self.depth is None else self.depth[frames]
+        return replace(self, rgb=self.rgb[frames], camera=self.camera.select(frames), depth=depth)
+
+    def shrunk(self, max_width: int) -> "View":
+        """The same video with at most `max_width` columns; depth keeps its values (nearest pixel)."""
+        height, width = self.rgb.shape[1:3]
+        if width <= max_width:
+            return self
+        size = (max_width, round(height * max_width / width))
+        rgb = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in self.rgb.numpy()])
+        depth: Float[Tensor, "t h w"] | None = None
+        if self.depth is not None:
+            images = [cv2.resize(image, size, interpolation=cv2.INTER_NEAREST) for image in self.depth.numpy()]
+            depth = torch.from_numpy(np.stack(images))
+        return View(torch.from_numpy(rgb), self.camera.resized(*size), depth, self.depth_range)

@@ -6,10 +6,9 @@ from pathlib import Path
 
 from lerobot.scripts.convert_dataset_v21_to_v30 import convert_dataset
 
-from lerobot_msdyn.core.errors import DatasetError
+from lerobot_msdyn.core.errors import DatasetError, first_line
 from lerobot_msdyn.core.files import temporary_files_in, writing
 from lerobot_msdyn.dataset.checks import check_features, read_json, regular_file
-from lerobot_msdyn.dataset.rows import first_line
 
 logger = logging.getLogger(__name__)
 

@@ -22,10 +22,11 @@ from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack, intrinsics_from_fov, read_calibration, static_camera
 from lerobot_msdyn.core.config import CameraConfig
-from lerobot_msdyn.core.errors import DatasetError, EpisodeError
+from lerobot_msdyn.core.errors import DatasetError, EpisodeError, first_line
+from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.dataset.checks import check_metadata, picture_size, read_json
 from lerobot_msdyn.dataset.chroma import is_subsampled, restore_chroma
-from lerobot_msdyn.dataset.rows import TIMESTAMP_TOLERANCE_S, first_line, read_rows, source_file, task_of
+from lerobot_msdyn.dataset.rows import TIMESTAMP_TOLERANCE_S, read_rows, source_file, task_of
 
 VIDEO_BACKEND = "pyav"
 CODEBASE_VERSION = "v3.0"
@@ -34,16 +35,6 @@ VIDEO_ERRORS = (av.FFmpegError, OSError, ValueError, RuntimeError, IndexError, A
 BLOCK_FRAMES = 128  # that are decoded at once
 MILLIMETRES = 1000.0
 ON_ROBOT = ("wrist", "hand", "gripper", "palm", "finger", "effector", "flange", "tool")  # in names of cameras
-
-
-@dataclass(frozen=True)
-class View:
-    """What one camera recorded."""
-
-    rgb: UInt8[Tensor, "t h w 3"]
-    camera: CameraTrack
-    depth: Float[Tensor, "t h w"] | None = None  # m, z-depth; as recorded, see `depth_range`
-    depth_range: tuple[float, float] = (0.0, float("inf"))  # m; values at the ends mean "not measured"
 
 
 @dataclass(frozen=True)
@@ -222,20 +213,6 @@ def make_camera(key: str, index: int, rgb: UInt8[Tensor, "t h w 3"], config: Cam
         if camera is not None:
             return camera
     return static_camera(intrinsics_from_fov(width, height, config.horizontal_fov_deg), frames, width, height)
-
-
-def shrink(view: View, max_width: int) -> View:
-    """The same video with at most `max_width` columns; depth keeps its values (nearest pixel)."""
-    height, width = view.rgb.shape[1:3]
-    if width <= max_width:
-        return view
-    size = (max_width, round(height * max_width / width))
-    rgb = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in view.rgb.numpy()])
-    depth: Float[Tensor, "t h w"] | None = None
-    if view.depth is not None:
-        images = [cv2.resize(image, size, interpolation=cv2.INTER_NEAREST) for image in view.depth.numpy()]
-        depth = torch.from_numpy(np.stack(images))
-    return View(torch.from_numpy(rgb), view.camera.resized(*size), depth, view.depth_range)
 
 
 def depth_key_of(meta: LeRobotDatasetMetadata, camera: str) -> str | None:

@@ -9,7 +9,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from lerobot.datasets import LeRobotDatasetMetadata
 
-from lerobot_msdyn.core.errors import DatasetError, EpisodeError
+from lerobot_msdyn.core.errors import DatasetError, EpisodeError, first_line
 from lerobot_msdyn.dataset.checks import PICTURE_DTYPES, TEXT_DTYPES, place_problem, regular_file
 
 TIMESTAMP_TOLERANCE_S = 1e-4  # LeRobot's
@@ -101,9 +101,3 @@ def _rows_problem(rows: pa.Table, meta: LeRobotDatasetMetadata) -> str | None:
     known = set(meta.tasks["task_index"].tolist())
     unknown = set(pc.unique(rows["task_index"]).to_pylist()) - known
     return f"task_index is {min(unknown)}; meta/tasks.parquet has no such task" if unknown else None
-
-
-def first_line(error: BaseException) -> str:
-    """An error of a library in one line."""
-    text = str(error).strip()
-    return f"{type(error).__name__}: {text.splitlines()[0]}" if text else type(error).__name__

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from lerobot_msdyn.core.cli import EXIT_OK, parse_config, run_command
-from lerobot_msdyn.core.config import DycheckConfig, EvaluateConfig, HeldoutCameraConfig
 from lerobot_msdyn.core.errors import ConfigError
+from lerobot_msdyn.evaluate.config import DycheckConfig, EvaluateConfig, HeldoutCameraConfig
 
 COMMAND = "python -m lerobot_msdyn.evaluate"
 

@@ -10,16 +10,18 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from numpy import ndarray
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.core.config import HeldoutCameraConfig
 from lerobot_msdyn.core.errors import ConfigError
-from lerobot_msdyn.dataset.read import Episode, View, colour_cameras, open_source, read_episode, select_cameras
+from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.dataset.read import Episode, colour_cameras, open_source, read_episode, select_cameras
 from lerobot_msdyn.evaluate.colour import fit_colours
+from lerobot_msdyn.evaluate.config import HeldoutCameraConfig
 from lerobot_msdyn.evaluate.perceptual import without_flip
 from lerobot_msdyn.evaluate.scores import NEVER, SEEN, Evaluated, Scores, TrueViews, score_table, score_views
 from lerobot_msdyn.evaluate.timing import timed, timed_reconstruction
 from lerobot_msdyn.evaluate.warp import warped
 from lerobot_msdyn.priors import estimate_masks
-from lerobot_msdyn.views.pictures import Reconstruction, new_pictures
+from lerobot_msdyn.reconstruction.result import Reconstruction
+from lerobot_msdyn.views.pictures import new_pictures
 
 FIT, SCORED = slice(0, None, 2), slice(1, None, 2)  # frames that colours are fitted to, and those that are scored
 BLACK = 20  # of 0..255: what the codec makes of black stays below

@@ -16,13 +16,15 @@ from jaxtyping import UInt8
 from numpy import ndarray
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.core.config import EvaluateConfig
 from lerobot_msdyn.core.errors import DatasetError
-from lerobot_msdyn.dataset.read import View, open_source, read_episode, select_cameras
+from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.dataset.read import open_source, read_episode, select_cameras
+from lerobot_msdyn.evaluate.config import EvaluateConfig
 from lerobot_msdyn.evaluate.perceptual import without_flip
 from lerobot_msdyn.evaluate.scores import Evaluated, Scores, TrueViews, mean_scores, score_table, score_views
 from lerobot_msdyn.evaluate.timing import timed, timed_reconstruction
-from lerobot_msdyn.views.pictures import Reconstruction, new_pictures
+from lerobot_msdyn.reconstruction.result import Reconstruction
+from lerobot_msdyn.views.pictures import new_pictures
 
 
 def evaluate_nvs(config: EvaluateConfig) -> Evaluated:

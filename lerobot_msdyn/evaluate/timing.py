@@ -5,9 +5,9 @@ import time
 from collections.abc import Iterator, Sequence
 
 from lerobot_msdyn.core.config import Recipe
-from lerobot_msdyn.dataset.read import View
-from lerobot_msdyn.reconstruct.reconstruct import reconstruct
-from lerobot_msdyn.views.pictures import Reconstruction
+from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.reconstruction.reconstruct import reconstruct
+from lerobot_msdyn.reconstruction.result import Reconstruction
 
 
 @contextlib.contextmanager
@@ -24,6 +24,6 @@ def timed_reconstruction(
     """A reconstructed view; its time (s) is told apart into what comes before the fit, and the fit."""
     start = time.perf_counter()
     scene = reconstruct(view, recipe, others=others)
-    seconds["priors and initialisation"] = time.perf_counter() - start - scene.seconds
-    seconds["fit"] = scene.seconds
+    seconds["priors and initialisation"] = time.perf_counter() - start - scene.seconds["fit"]
+    seconds["fit"] = scene.seconds["fit"]
     return scene

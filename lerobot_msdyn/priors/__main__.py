@@ -6,12 +6,14 @@ python -m lerobot_msdyn.priors --repo local/ds --episodes '[0]' --out DIR
 import logging
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lerobot_msdyn.core.cli import EXIT_OK, EXIT_SOME_EPISODES_FAILED, parse_config, run_command
-from lerobot_msdyn.core.config import PriorsCommandConfig
+from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import ConfigError, EpisodeError, OutputError
+from lerobot_msdyn.core.fields import between
 
 if TYPE_CHECKING:
     from lerobot_msdyn.dataset.read import Episode
@@ -19,6 +21,24 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 COMMAND = "python -m lerobot_msdyn.priors"
+
+
+@dataclass
+class PriorsCommandConfig(Recipe):
+    """`python -m lerobot_msdyn.priors`: compute the priors alone, and draw them."""
+
+    # Source dataset (alias: --repo).
+    repo_id: str = ""
+    # Exact folder of the source dataset; default: LeRobot's home, then the hub.
+    root: Path | None = None
+    # Episodes, e.g. 0 or '[0,3]'; default: all.
+    episodes: list[int] | int | None = None
+    # Where the results go: OUT/episode_000000/<camera>.npz and OUT/episode_000000.png.
+    out: Path = Path()
+    # Columns of the contact sheet.
+    columns: int = between(6, 1, 100)
+
+
 ALIASES = {"repo": "repo_id"}
 
 
@@ -56,13 +76,12 @@ def one_episode(episode: "Episode", config: PriorsCommandConfig) -> None:
     """
     import cv2
 
-    from lerobot_msdyn.dataset.read import shrink
     from lerobot_msdyn.priors import estimate_priors
     from lerobot_msdyn.priors.exchange import from_priors, write_exchange
     from lerobot_msdyn.priors.sheet import contact_sheet
 
     index, name = episode.source.index, f"episode_{episode.source.index:06d}"
-    views = {key: shrink(view, config.fit.max_width) for key, view in episode.views.items()}
+    views = {key: view.shrunk(config.fit.max_width) for key, view in episode.views.items()}
     videos = []
     for key, view in views.items():
         start = time.perf_counter()

@@ -7,8 +7,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from lerobot_msdyn.core.config import CameraConfig, PriorsConfig
-from lerobot_msdyn.core.observations import Priors
-from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.core.observations import Priors, View
 from lerobot_msdyn.priors.cache import open_cache
 from lerobot_msdyn.priors.camera.provide import provide_camera, with_searched_fov
 from lerobot_msdyn.priors.depth.provide import provide_depth
@@ -50,17 +49,17 @@ def estimate_priors(
     request = Request(view, config, camera, cache, others, elsewhere, episode, key, torch_device(device))
     instances, masks_from = provide_masks(request)
     request, camera_from = provide_camera(request, instances)
-    (depth, metric), depth_from = provide_depth(request, instances)
+    (depth, traits), depth_from = provide_depth(request, instances)
     tracks, tracks_from = provide_tracks(request, instances)
     pinhole = request.view.camera
     if camera.fov_search:
-        pinhole, camera_from = with_searched_fov(pinhole, tracks, depth, depth_from.provider)
+        pinhole, camera_from = with_searched_fov(pinhole, tracks, depth, traits)
     origins = {"camera": camera_from, "masks": masks_from, "depth": depth_from, "tracks": tracks_from}
     found = {"masks": f", {int(instances.max())} instances", "tracks": f", {len(tracks)} tracks"}
     for prior, origin in origins.items():
         logger.info("%s: %s%s", prior, origin.line, found.get(prior, ""))
     provenance = {prior: origin.entry() for prior, origin in origins.items()}
-    return Priors(depth, instances, tracks, metric, provenance, pinhole)
+    return Priors(depth, instances, tracks, traits, provenance, pinhole)
 
 
 def estimate_masks(

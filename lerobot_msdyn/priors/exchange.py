@@ -15,9 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, Shaped, UInt8
 from numpy import ndarray
 
-from lerobot_msdyn.core.errors import PriorError
-from lerobot_msdyn.core.observations import Priors
-from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.core.errors import PriorError, first_line
+from lerobot_msdyn.core.observations import Priors, View
 from lerobot_msdyn.priors.cache import save_npz
 
 DEPTH_KINDS = ("metric", "scale", "affine_disparity")
@@ -149,7 +148,7 @@ def _load(path: Path) -> dict[str, ndarray]:
             return {name: file[name] for name in file.files}
     except (OSError, ValueError, KeyError, EOFError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
         raise PriorError(
-            f"{path}: not a readable npz file of plain arrays ({_first_line(error)}); see docs/priors.md"
+            f"{path}: not a readable npz file of plain arrays ({first_line(error)}); see docs/priors.md"
         ) from error
 
 
@@ -246,7 +245,3 @@ def _provenance(path: Path, arrays: dict[str, ndarray]) -> dict[str, Any]:
     except ValueError as error:
         raise PriorError(f"{path}: provenance is not JSON ({error})") from error
     return content if isinstance(content, dict) else {"note": content}
-
-
-def _first_line(error: BaseException) -> str:
-    return f"{type(error).__name__}: {str(error).strip().splitlines()[0] if str(error).strip() else ''}"

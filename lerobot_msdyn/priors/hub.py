@@ -8,6 +8,7 @@ import torch
 from huggingface_hub import constants, try_to_load_from_cache
 
 from lerobot_msdyn.core.errors import PriorError
+from lerobot_msdyn.core.observations import Origin
 
 UNKNOWN_LICENCE = "unknown: read its model card"
 NON_COMMERCIAL = "CC-BY-NC-4.0"
@@ -37,6 +38,11 @@ class LocalModel:
     folder: Path
     revision: str  # commit on the hub; "local" for a folder
     licence: str
+
+
+def learned_origin(provider: str, model: LocalModel, why: str) -> Origin:
+    """The origin of what a learned model predicted."""
+    return Origin(provider, why, model.name, model.revision, model.licence)
 
 
 def find_model(name: str) -> LocalModel | None:

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from lerobot_msdyn.core.config import CameraConfig, PriorsConfig
 from lerobot_msdyn.core.errors import PriorError
-from lerobot_msdyn.core.observations import Origin
-from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.core.observations import Origin, View
 from lerobot_msdyn.priors.cache import PriorCache
 from lerobot_msdyn.priors.exchange import Exchange, exchange_path, read_exchange
 

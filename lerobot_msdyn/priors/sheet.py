@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float32, Int, UInt8
 from numpy import ndarray
 
-from lerobot_msdyn.core.observations import PointTracks, Priors
-from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.core.observations import PointTracks, Priors, View
+from lerobot_msdyn.core.sampling import evenly
 
 _CELL_WIDTH = 320  # px
 _GAP, _LINE = 4, 22  # px: between pictures, and of a line of text
@@ -46,7 +46,7 @@ def contact_sheet(
 
 
 def _block(name: str, view: View, priors: Priors, fps: int | float, columns: int) -> UInt8[ndarray, "_ _ 3"]:
-    frames = np.unique(np.linspace(0, len(view.rgb) - 1, columns).round().astype(int)).tolist()
+    frames = evenly(len(view), columns).tolist()
     rgb = view.rgb.numpy()
     near, far = depth_range(priors)
     tail = max(1, round(_TAIL_S * fps))

@@ -7,8 +7,9 @@ from pathlib import Path
 import pyarrow.parquet as pq
 from lerobot.datasets import LeRobotDatasetMetadata
 
+from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.core.cli import parse_config
-from lerobot_msdyn.core.config import AugmentConfig, Recipe
+from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import DatasetError
 from lerobot_msdyn.dataset import provenance
 from lerobot_msdyn.scene import store as saved

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from lerobot.datasets import LeRobotDataset
 
-from lerobot_msdyn.core.config import MixedViewsConfig, PerturbationConfig
+from lerobot_msdyn.core.config import PerturbationConfig
+from lerobot_msdyn.training.config import MixedViewsConfig
 from lerobot_msdyn.training.mixer import ViewMixer, colour_sample, depth_sample
 from lerobot_msdyn.training.scene_cache import Scenes
 

@@ -12,10 +12,12 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.core.config import MixedViewsConfig, OtherCameraConfig, PerturbationConfig, problems
+from lerobot_msdyn.core.config import OtherCameraConfig, PerturbationConfig
 from lerobot_msdyn.core.errors import ConfigError
+from lerobot_msdyn.core.fields import problems
 from lerobot_msdyn.dataset.read import MILLIMETRES, depth_key_of
 from lerobot_msdyn.scene.store import SavedScene
+from lerobot_msdyn.training.config import MixedViewsConfig
 from lerobot_msdyn.training.live import LiveScene
 from lerobot_msdyn.training.matching import recipe_of, scenes_of
 from lerobot_msdyn.training.scene_cache import SceneCache, Scenes

@@ -6,7 +6,8 @@ from typing import Any
 
 import torch
 
-from lerobot_msdyn.core.config import MixedViewsConfig, PerturbationConfig
+from lerobot_msdyn.core.config import PerturbationConfig
+from lerobot_msdyn.training.config import MixedViewsConfig
 from lerobot_msdyn.training.mixer import ViewMixer, colour_sample, depth_sample
 from lerobot_msdyn.training.scene_cache import Scenes
 

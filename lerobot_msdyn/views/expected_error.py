@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.geometry import pixel_grid, project, transform_points, unproject
-from lerobot_msdyn.reconstruct.self_check import Witness, decibels
+from lerobot_msdyn.reconstruction.self_check import SelfCheck, decibels
 
 FINEST_PX = 12**-0.5  # along each axis, by which a point is off that lies anywhere within a pixel: (1/12)^(1/2)
 BETWEEN = 0.5  # where two depths disagree, the truth is taken to lie in the middle
@@ -45,25 +45,25 @@ class Expected:
 
 
 @torch.no_grad()
-def expected_error(witness: Witness, new: CameraTrack) -> Expected:
-    """What is to be expected of a new camera, one pose per frame of the witness.
+def expected_error(check: SelfCheck, new: CameraTrack) -> Expected:
+    """What is to be expected of a new camera, one pose per frame of the checked frames.
 
     Args:
-        witness: what the scene says of its own video.
+        check: what the scene says of its own video.
         new: the new camera at those frames, at any size.
     """
-    camera, known = witness.camera, witness.depth > 0
+    camera, known = check.camera, check.depth > 0
     new = new.resized(camera.width, camera.height)
-    prior = torch.where(known, witness.depth, witness.drawn_depth)
+    prior = torch.where(known, check.depth, check.drawn_depth)
     place = _seen_from(camera, new, prior)
-    drawn = (_seen_from(camera, new, witness.drawn_depth) - place) * BETWEEN
-    unsure = _seen_from(camera, new, prior * (1 + witness.depth_error)) - place
+    drawn = (_seen_from(camera, new, check.drawn_depth) - place) * BETWEEN
+    unsure = _seen_from(camera, new, prior * (1 + check.depth_error)) - place
     within = torch.full_like(drawn, FINEST_PX)
     return Expected(
-        witness.error,
-        _misplaced(witness.recorded, drawn * (known & (witness.drawn_depth > 0))[..., None]),
-        _misplaced(witness.recorded, unsure * (prior > 0)[..., None]),
-        _misplaced(witness.recorded, within),
+        check.error,
+        _misplaced(check.recorded, drawn * (known & (check.drawn_depth > 0))[..., None]),
+        _misplaced(check.recorded, unsure * (prior > 0)[..., None]),
+        _misplaced(check.recorded, within),
     )
 
 

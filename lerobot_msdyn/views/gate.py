@@ -1,4 +1,4 @@
-"""The gate: scores of a new view at the witnesses' frames, and whether it is kept, with the reason in words."""
+"""The gate: scores of a new view at the checked frames, and whether it is kept, with the reason in words."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,10 +13,10 @@ from numpy import ndarray
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.config import GateConfig
 from lerobot_msdyn.core.serialise import to_device
-from lerobot_msdyn.reconstruct.self_check import Witness, decibels, flicker, sharpness, stands_still
+from lerobot_msdyn.reconstruction.result import FittedWindow
+from lerobot_msdyn.reconstruction.self_check import decibels, flicker, sharpness, stands_still
 from lerobot_msdyn.scene.draw import Rendering, draw
-from lerobot_msdyn.scene.gaussians import DynamicScene
-from lerobot_msdyn.views.coverage import Coverage, Evidence, coverage_of
+from lerobot_msdyn.views.coverage import Coverage, coverage_of
 from lerobot_msdyn.views.expected_error import Expected, expected_error
 
 HEAT_WIDTH = 24  # columns of the map of what is unseen
@@ -58,55 +58,45 @@ class Scores:
     heat: list[list[int]]  # percent of the judged frames in which a part of the picture is unseen
 
 
-@dataclass(frozen=True)
-class Witnessed:
-    """One window of an episode: its scene and what is known about it."""
-
-    scene: DynamicScene
-    evidence: Evidence
-    witness: Witness
-    start: int  # first frame of the window in the episode
-
-
 @torch.no_grad()
-def judge(windows: Sequence[Witnessed], camera: CameraTrack) -> Scores:
+def judge(windows: Sequence[FittedWindow], camera: CameraTrack) -> Scores:
     """Scores of an episode seen through another camera (any size, one pose per frame of the episode)."""
     frames: list[FrameScores] = []
     expected: list[Expected] = []
     unseen, steady, own = [], 0.0, 0.0
     for window in windows:
-        witness = window.witness
-        fitted = witness.camera
-        poses = camera.select(witness.frames + window.start).resized(fitted.width, fitted.height)
-        error = expected_error(witness, poses)
+        check = window.self_check
+        fitted = check.camera
+        poses = camera.select(check.frames + window.start).resized(fitted.width, fitted.height)
+        error = expected_error(check, poses)
         drawn, found = _draw(window, poses)
         pictures = drawn.rgb.clamp(0, 1)
-        after = (witness.frames + 1).clamp(max=window.scene.frames - 1)
+        after = (check.frames + 1).clamp(max=window.scene.frames - 1)
         following = to_device(draw(window.scene, poses, after), "cpu")
         still = stands_still(drawn.moving > 0.05) & stands_still(following.moving > 0.05)
         steady += len(poses) * flicker(pictures, following.rgb.clamp(0, 1), still)
-        own += len(poses) * witness.flicker
+        own += len(poses) * check.flicker
         expected.append(error)
         unseen += [coverage.unseen for coverage in found]
-        for i, (frame, coverage) in enumerate(zip(witness.frames.tolist(), found, strict=True)):
-            ratio = sharpness(pictures[i : i + 1]) / max(sharpness(witness.recorded[i : i + 1]), 1e-9)
+        for i, (frame, coverage) in enumerate(zip(check.frames.tolist(), found, strict=True)):
+            ratio = sharpness(pictures[i : i + 1]) / max(sharpness(check.recorded[i : i + 1]), 1e-9)
             seen = ~coverage.unseen
             angle = float(coverage.angle_deg[seen].mean()) if seen.any() else 180.0
             frames.append(
                 FrameScores(frame + window.start, decibels(float(error.total[i])), coverage.unseen_share, angle, ratio)
             )
     total = Expected(**{name: torch.cat([getattr(part, name) for part in expected]) for name in vars(expected[0])})
-    witnesses = [window.witness for window in windows]
+    checks = [window.self_check for window in windows]
     return Scores(
         total.psnr_db,
         total.shares,
-        decibels(float(torch.cat([witness.fitted_error for witness in witnesses]).mean())),
-        float(np.mean([witness.ssim for witness in witnesses])),
-        decibels(float(np.mean([witness.moving_error for witness in witnesses]))),
-        all(witness.held_out for witness in witnesses),
+        decibels(float(torch.cat([check.fitted_error for check in checks]).mean())),
+        float(np.mean([check.ssim for check in checks])),
+        decibels(float(np.mean([check.moving_error for check in checks]))),
+        all(check.held_out for check in checks),
         float(np.mean([frame.unseen for frame in frames])),
         float(np.mean([frame.angle_deg for frame in frames])),
-        float(np.mean([witness.track_px for witness in witnesses])),
+        float(np.mean([check.track_px for check in checks])),
         steady / own if own > 0 else 1.0,
         float(np.mean([frame.sharpness_ratio for frame in frames])),
         frames,
@@ -152,10 +142,10 @@ def _plain(value: Any) -> Any:
     return {name: _plain(item) for name, item in vars(value).items()} if isinstance(value, FrameScores) else value
 
 
-def _draw(window: Witnessed, poses: CameraTrack) -> tuple[Rendering, list[Coverage]]:
-    """The witnesses' frames through other poses, and what is known about their pixels; on the host."""
-    drawn = draw(window.scene, poses, window.witness.frames, extra=window.evidence.moving_frames)
-    return to_device(drawn, "cpu"), coverage_of(drawn, poses, window.witness.frames, window.evidence)
+def _draw(window: FittedWindow, poses: CameraTrack) -> tuple[Rendering, list[Coverage]]:
+    """The checked frames through other poses, and what is known about their pixels; on the host."""
+    drawn = draw(window.scene, poses, window.self_check.frames, extra=window.evidence.moving_frames)
+    return to_device(drawn, "cpu"), coverage_of(drawn, poses, window.self_check.frames, window.evidence)
 
 
 def _heat(unseen: Float[ndarray, "h w"]) -> list[list[int]]:

@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
 from numpy import ndarray
 from torch import Tensor
@@ -12,9 +11,11 @@ from torch import Tensor
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.config import PosesConfig, Recipe
 from lerobot_msdyn.core.errors import ConfigError
-from lerobot_msdyn.views.coverage import is_behind
+from lerobot_msdyn.core.sampling import evenly
+from lerobot_msdyn.reconstruction.evidence import is_behind
+from lerobot_msdyn.reconstruction.result import Reconstruction
 from lerobot_msdyn.views.perturbation import Viewpoint, amounts_of, described, draw, moved
-from lerobot_msdyn.views.pictures import Reconstruction, coverages
+from lerobot_msdyn.views.pictures import coverages
 
 FRAMES = 4  # at which coverage is looked at
 ROUNDS = 5  # of bisection
@@ -92,13 +93,13 @@ def largest_factor(unseen_at: Callable[[float], float], bound: float) -> float |
 
 def is_behind_scene(scene: Reconstruction, camera: CameraTrack) -> bool:
     """Whether a camera is ever behind what stands before the recorded one."""
-    return any(is_behind(evidence, camera.world_from_camera[:, :3, 3]) for evidence in scene.evidence)
+    return any(is_behind(window.evidence, camera.world_from_camera[:, :3, 3]) for window in scene.windows)
 
 
 def _looked_at(scene: Reconstruction, camera: CameraTrack) -> tuple[CameraTrack, Tensor]:
     """Some of a new camera's frames at the size at which the scene was fitted, and their numbers."""
-    frames = torch.linspace(0, len(camera) - 1, min(FRAMES, len(camera))).round().long()
-    fitted = scene.evidence[0].camera
+    frames = evenly(len(camera), FRAMES)
+    fitted = scene.windows[0].evidence.camera
     return camera.select(frames).resized(fitted.width, fitted.height), frames
 
 

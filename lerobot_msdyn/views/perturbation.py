@@ -51,16 +51,6 @@ class Viewpoint:
     metric: bool  # whether metres are true ones
 
 
-def look_at_distance(depth: Float[Tensor, "h w"]) -> float:
-    """Distance (m) to what the camera looks at: the median known depth of the middle of the image."""
-    h, w = depth.shape
-    middle = depth[h // 4 : h - h // 4, w // 4 : w - w // 4]
-    known = middle[middle > 0]
-    if known.numel() == 0:
-        known = depth[depth > 0]
-    return float(known.median()) if known.numel() else 1.0
-
-
 def draw(
     config: PerturbationConfig, seed: int, episode: int, variant: int, frames: int, attempt: int = 0
 ) -> Float[Tensor, "t n"]:

@@ -6,46 +6,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.config import Fill, Recipe
 from lerobot_msdyn.core.serialise import to_device
-from lerobot_msdyn.reconstruct.fit import FitResult
-from lerobot_msdyn.reconstruct.self_check import Witness
+from lerobot_msdyn.reconstruction.result import Reconstruction
 from lerobot_msdyn.scene.draw import Rendering, render_frames
 from lerobot_msdyn.scene.gaussians import DynamicScene
-from lerobot_msdyn.views.coverage import Coverage, Evidence, coverage_of
+from lerobot_msdyn.views.coverage import Coverage, coverage_of
 from lerobot_msdyn.views.filling import filled, missing
-from lerobot_msdyn.views.gate import Witnessed
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Reconstruction:
-    """One camera's scenes, one per window of its video, and what was known about it."""
-
-    results: tuple[FitResult, ...]
-    starts: tuple[int, ...]  # first frame of each window
-    metric: bool  # whether depth is in true metres, in all windows
-    provenance: dict[str, dict[str, str]]  # prior -> provider, why, model and licence, of all windows
-    camera: CameraTrack  # at the size of the recorded video
-    distance: float  # m, to the look-at point
-    evidence: tuple[Evidence, ...]  # what the recorded camera showed in each window
-    witnesses: tuple[Witness, ...]  # how well each window's scene explains its own video
-
-    @property
-    def windows(self) -> list[Witnessed]:
-        """What a new view is judged by."""
-        parts = zip(self.results, self.evidence, self.witnesses, self.starts, strict=True)
-        return [Witnessed(result.scene, seen, witness, start) for result, seen, witness, start in parts]
-
-    @property
-    def seconds(self) -> float:
-        """Time that was spent in fitting."""
-        return sum(result.seconds for result in self.results)
 
 
 @dataclass(frozen=True)
@@ -84,8 +57,11 @@ def new_pictures(
 
 def on_device(scene: Reconstruction, device: torch.device) -> Reconstruction:
     """The same with what is drawn, and what it is compared with pixel by pixel, on a device."""
-    results, evidence = to_device((scene.results, scene.evidence), device)
-    return replace(scene, results=results, evidence=evidence)
+    windows = tuple(
+        replace(window, scene=to_device(window.scene, device), evidence=to_device(window.evidence, device))
+        for window in scene.windows
+    )
+    return replace(scene, windows=windows)
 
 
 class UnseenMasks:
@@ -113,9 +89,9 @@ def _drawn(
 ) -> Iterator[tuple[Rendering, list[Coverage], Float[Tensor, "#t #h #w 3"]]]:
     """Some frames at a time through another camera, what is known about them, and what stands where nothing is."""
     frames = torch.arange(len(scene.camera)) if frames is None else frames
-    for window, part in _parts(scene, frames):
-        drawn, evidence = scene.results[window].scene, scene.evidence[window]
-        times, poses = frames[part] - scene.starts[window], camera.select(part)
+    for window, part in scene.stretches(frames):
+        drawn, evidence = window.scene, window.evidence
+        times, poses = frames[part] - window.start, camera.select(part)
         once = _still_filled(drawn, poses, times, fill) if poses.is_static and fill != "none" else None
         done = 0
         for rendering in render_frames(drawn, poses, times, extra=evidence.moving_frames):
@@ -149,14 +125,3 @@ def _brightness(scene: DynamicScene, times: Tensor, all_times: Tensor) -> Float[
     middle = all_times[len(all_times) // 2]
     gains = scene.shading.static_gain(torch.cat((middle[None], times))).mean(1)
     return (gains[1:] / gains[0])[:, None, None, None]
-
-
-def _parts(scene: Reconstruction, frames: Int[Tensor, " t"]) -> Iterator[tuple[int, slice]]:
-    """Stretches of frames that are of the same window, in order, with the window."""
-    window = torch.searchsorted(torch.tensor(scene.starts), frames, right=True) - 1
-    start = 0
-    for index, count in zip(
-        *(values.tolist() for values in window.unique_consecutive(return_counts=True)), strict=True
-    ):
-        yield index, slice(start, start + count)
-        start += count

@@ -9,7 +9,8 @@ from lerobot_msdyn.augment.moving_cameras import correlation, still_cameras, why
 from lerobot_msdyn.core.cameras import intrinsics_from_fov, static_camera
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import DatasetError
-from lerobot_msdyn.dataset.read import Episode, EpisodeSource, View, is_wrist_camera, open_source, select_cameras
+from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.dataset.read import Episode, EpisodeSource, is_wrist_camera, open_source, select_cameras
 
 FRAMES, WIDTH, HEIGHT = 60, 160, 120
 

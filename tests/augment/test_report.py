@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from lerobot_msdyn.augment.report import build
 
 from lerobot_msdyn.augment import __main__ as augment
+from lerobot_msdyn.augment.report import build
 from lerobot_msdyn.augment.report.drawing import cameras_from_above
 from lerobot_msdyn.augment.report.page import LISTED, Pictures, ViewEntry, page
 from lerobot_msdyn.augment.report.pictures import data_url, film, heat_map, spread, strip
-from lerobot_msdyn.reconstruct import reconstruct as pipeline
+from lerobot_msdyn.reconstruction import reconstruct as pipeline
 
 FRONT = "observation.images.front"
 FAST = ("--fit.steps", "4", "--scene.moving_gaussians", "500", "--scene.moving_frames", "4", "--fit.max_width", "48")

@@ -7,7 +7,7 @@ import torch
 
 from lerobot_msdyn.augment import run as engines
 from lerobot_msdyn.augment import workers
-from lerobot_msdyn.core.config import AugmentConfig
+from lerobot_msdyn.augment.config import AugmentConfig
 
 
 @pytest.mark.parametrize(("device", "expected"), [("cuda", 2), ("cpu", 5)])

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from lerobot_msdyn.augment import __main__ as augment
+from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.augment.workers import workers_for
-from lerobot_msdyn.core.config import AugmentConfig
 
 FAST = (
     "--fit.steps",

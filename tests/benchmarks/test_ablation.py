@@ -83,7 +83,7 @@ def test_motion_that_is_learned_changes_in_the_fit_and_is_fixed_afterwards(ablat
     for name, tensor in (("L1-L3, learned", "displacements"), ("field, learned afresh", "last")):
         row = next(row for row in ablation.ROWS if row.name == name)
         scenes = [
-            ablation.reconstructed(known, one, ablation.recipe_of(one, settings, 0)).results[0].scene
+            ablation.reconstructed(known, one, ablation.recipe_of(one, settings, 0)).windows[0].scene
             for one in (replace(row, learned=""), row)
         ]
         fixed, learned = (getattr(scene.levels[0], tensor) for scene in scenes)

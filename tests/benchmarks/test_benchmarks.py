@@ -13,7 +13,7 @@ import torch
 
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.geometry import axis_angle_to_matrix, se3
-from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.motion.model.compose import compose
 from lerobot_msdyn.synthetic import make_scene
 

@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 import yaml
 
+from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.core import config as config_module
 from lerobot_msdyn.core.cli import format_help, parse_config, read_recipe, recipe_folder
-from lerobot_msdyn.core.config import AugmentConfig, JitterConfig, OrbitConfig, Recipe
+from lerobot_msdyn.core.config import JitterConfig, OrbitConfig, Recipe
 from lerobot_msdyn.core.errors import ConfigError
 
 PROJECT = Path(__file__).parents[2]

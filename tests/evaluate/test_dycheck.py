@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from lerobot_msdyn.core.config import Protocol
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.evaluate import __main__ as evaluate
+from lerobot_msdyn.evaluate.config import Protocol
 from lerobot_msdyn.evaluate.dycheck.iphone import read_sequence
 from lerobot_msdyn.evaluate.metrics import masked_psnr_db, partial_ssim
 

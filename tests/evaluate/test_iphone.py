@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from lerobot_msdyn.core.cli import run_command
-from lerobot_msdyn.core.config import Protocol
 from lerobot_msdyn.core.errors import DatasetError
 from lerobot_msdyn.evaluate import __main__ as evaluate
+from lerobot_msdyn.evaluate.config import Protocol
 from lerobot_msdyn.evaluate.dycheck.iphone import read_sequence
 from lerobot_msdyn.evaluate.dycheck.iphone_priors import read_priors
 from lerobot_msdyn.synthetic.iphone import write_iphone_folder

@@ -7,8 +7,9 @@ import torch
 
 from lerobot_msdyn.augment import __main__ as augment
 from lerobot_msdyn.core.config import Device, Recipe
-from lerobot_msdyn.dataset.read import View
-from lerobot_msdyn.reconstruct import reconstruct as pipeline
+from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.reconstruction import reconstruct as pipeline
+from lerobot_msdyn.reconstruction.self_check import decibels
 from lerobot_msdyn.render.availability import cuda_problem
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.views.pictures import new_pictures, on_device
@@ -33,8 +34,8 @@ def test_both_routes_reach_the_same_held_out_quality() -> None:
         recipe = Recipe(device=device)
         recipe.fit.steps, recipe.priors.cache = 200, "off"
         scene = pipeline.reconstruct(View(seen.rgb, video.camera, seen.depth), recipe)
-        assert scene.results[0].scene.device.type == "cpu"
-        found[device] = scene.witnesses[0].psnr_db
+        assert scene.windows[0].scene.device.type == "cpu"
+        found[device] = decibels(float(scene.windows[0].self_check.fitted_error.mean()))
         drawn = on_device(scene, torch.device(device))
         pictures[device] = next(new_pictures(drawn, scene.camera)).rgb.astype(float)
     assert abs(found["cuda"] - found["cpu"]) < MAX_DIFFERENCE_DB, found

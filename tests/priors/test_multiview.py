@@ -8,7 +8,7 @@ import torch
 from test_stereo import moved
 
 from lerobot_msdyn.core.errors import PriorError
-from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.priors.depth.multiview import multiview_depth, usable_partners, why_no_partner
 from lerobot_msdyn.synthetic import make_scene
 

@@ -12,7 +12,7 @@ from huggingface_hub import constants
 from lerobot_msdyn.core.cameras import intrinsics_from_fov, static_camera
 from lerobot_msdyn.core.config import CameraConfig, PriorsConfig
 from lerobot_msdyn.core.errors import PriorError
-from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.priors import Priors, estimate_priors
 
 FRAMES = 12

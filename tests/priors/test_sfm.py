@@ -9,7 +9,7 @@ import torch
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.errors import PriorError
 from lerobot_msdyn.core.geometry import axis_angle_to_matrix, se3
-from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.priors.camera.sfm import camera_from_sfm, interpolated_poses
 from lerobot_msdyn.synthetic import make_scene
 

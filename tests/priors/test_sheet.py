@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from lerobot_msdyn.core.cameras import intrinsics_from_fov, static_camera
-from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.priors import PointTracks, Priors
 from lerobot_msdyn.priors.sheet import PALETTE, contact_sheet, depth_range, draw_depth
 

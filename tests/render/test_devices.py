@@ -11,19 +11,20 @@ from torch import Tensor
 
 from lerobot_msdyn.core.cameras import intrinsics_from_fov, static_camera
 from lerobot_msdyn.core.config import FitConfig
+from lerobot_msdyn.core.observations import DepthTraits, View
 from lerobot_msdyn.core.serialise import to_device
-from lerobot_msdyn.dataset.read import View
 from lerobot_msdyn.motion.model.bases import level_from_motions
 from lerobot_msdyn.priors import PointTracks, Priors
-from lerobot_msdyn.reconstruct.background import EmptyScene, background_gaussians
-from lerobot_msdyn.reconstruct.fit import FitResult, fit
-from lerobot_msdyn.reconstruct.make_overlay import unexplained
-from lerobot_msdyn.reconstruct.self_check import witness
+from lerobot_msdyn.reconstruction.background import EmptyScene, background_gaussians
+from lerobot_msdyn.reconstruction.evidence import evidence_of
+from lerobot_msdyn.reconstruction.fit import FitResult, fit
+from lerobot_msdyn.reconstruction.make_overlay import unexplained
+from lerobot_msdyn.reconstruction.result import FittedWindow, Reconstruction
+from lerobot_msdyn.reconstruction.self_check import self_check
 from lerobot_msdyn.scene import draw as rendering
 from lerobot_msdyn.scene.gaussians import DynamicScene
-from lerobot_msdyn.views.coverage import evidence_of
 from lerobot_msdyn.views.gate import judge
-from lerobot_msdyn.views.pictures import Reconstruction, coverages, new_pictures, on_device
+from lerobot_msdyn.views.pictures import coverages, new_pictures, on_device
 
 FRAMES, WIDTH, HEIGHT = 12, 32, 24
 STEPS = 52  # held-out frames are looked at every 50 steps
@@ -47,7 +48,7 @@ def video() -> tuple[View, Priors]:
     xy = torch.tensor([15.0, 12.0]).expand(1, FRAMES, 2)
     seen, weight = torch.ones(1, FRAMES, dtype=torch.bool), torch.ones(1, FRAMES)
     tracks = PointTracks(xy, seen, weight, torch.ones(1, dtype=torch.long))
-    return View(rgb, camera), Priors(torch.ones(FRAMES, HEIGHT, WIDTH), instances, tracks, metric=True)
+    return View(rgb, camera), Priors(torch.ones(FRAMES, HEIGHT, WIDTH), instances, tracks, DepthTraits(metric=True))
 
 
 def scene_of(view: View) -> DynamicScene:
@@ -78,9 +79,17 @@ def test_a_fit_stays_on_the_gpu(gpu: FakeGpu) -> None:
     assert result.scene.device.type == "cuda"
     waits = Counter(gpu.waits)
     every_step = {place for place, count in waits.items() if count >= STEPS}
-    assert every_step == {"fitting.py _check"}  # that the loss is finite
-    assert set(waits) - every_step == {"motion/bases.py _moves", "fitting.py psnr", "fitting.py _result"}
-    per_measured_frame = {"values.py to_device", "brightness.py _seen_sums", "fitting.py fit"}
+    assert every_step == {"reconstruction/fit.py _check"}  # that the loss is finite
+    assert set(waits) - every_step == {
+        "motion/model/bases.py _moves",
+        "reconstruction/fit.py psnr",
+        "reconstruction/fit.py _result",
+    }
+    per_measured_frame = {
+        "core/serialise.py to_device",
+        "reconstruction/brightness.py _seen_sums",
+        "reconstruction/fit.py fit",
+    }
     assert {place for place, count in Counter(gpu.copies).items() if count > FRAMES} <= per_measured_frame
 
 
@@ -90,11 +99,12 @@ def test_what_is_made_of_a_fit(gpu: FakeGpu) -> None:
     with gpu:
         result = fitted(view, priors)
         seen = evidence_of(result.scene, view.camera, empty)
-        said = witness(result.scene, view, priors, result.held_out)
+        said = self_check(result.scene, view, priors, result.held_out)
         overlay = unexplained(result.scene, view, priors)
         result = replace(result, scene=replace(result.scene, overlay=overlay))
-        host = to_device((result, seen), "cpu")
-        scene = Reconstruction((host[0],), (0,), True, {}, view.camera, 1.0, (host[1],), (said,))
+        host = to_device((result.scene, seen), "cpu")
+        window = FittedWindow(0, *host, said, STEPS, 0.0, {})
+        scene = Reconstruction((window,), True, {}, view.camera, 1.0)
         drawn = on_device(scene, GPU)
         gpu.waits.clear()
         gpu.copies.clear()
@@ -103,13 +113,13 @@ def test_what_is_made_of_a_fit(gpu: FakeGpu) -> None:
         filled = list(new_pictures(drawn, view.camera))
         scores = judge(drawn.windows, view.camera)
         shares = [found.unseen_share for found in coverages(drawn, view.camera)]
-    assert all(tensor.device.type == "cpu" for tensor in host[0].scene.tensors().values())
+    assert all(tensor.device.type == "cpu" for tensor in host[0].tensors().values())
     assert len(pictures) == len(filled) == len(shares) == FRAMES
     assert np.isfinite(scores.expected_db)
-    waits.pop("overlay.py _first")
-    assert waits == {"scene.py patched": FRAMES, "motion/bases.py _moves": 1}
+    waits.pop("scene/overlay.py _first")
+    assert waits == {"scene/gaussians.py patched": FRAMES, "motion/model/bases.py _moves": 1}
     batches = -(-FRAMES // 8)
-    assert copies == {"values.py to_device": 4 * FRAMES + 2 * batches}  # coverage; pictures and depth
+    assert copies == {"core/serialise.py to_device": 4 * FRAMES + 2 * batches}  # coverage; pictures and depth
 
 
 def test_values_keep_their_structure() -> None:

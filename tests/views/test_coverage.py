@@ -6,15 +6,16 @@ import torch
 from lerobot_msdyn.core.cameras import CameraTrack, intrinsics_from_fov, static_camera
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.geometry import se3
-from lerobot_msdyn.dataset.read import View
-from lerobot_msdyn.reconstruct.background import EmptyScene, background_gaussians
-from lerobot_msdyn.reconstruct.reconstruct import reconstruct
+from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.reconstruction.background import EmptyScene, background_gaussians
+from lerobot_msdyn.reconstruction.evidence import Evidence, evidence_of
+from lerobot_msdyn.reconstruction.reconstruct import reconstruct
 from lerobot_msdyn.scene.draw import draw
 from lerobot_msdyn.scene.gaussians import DynamicScene
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.nvs import covisibility
 from lerobot_msdyn.synthetic.viewpoints import heldout_cameras
-from lerobot_msdyn.views.coverage import Coverage, Evidence, coverage_of, evidence_of
+from lerobot_msdyn.views.coverage import Coverage, coverage_of
 from lerobot_msdyn.views.pictures import coverages, new_pictures
 
 WIDTH, HEIGHT = 64, 48

@@ -7,11 +7,12 @@ import torch
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.config import GateConfig, Recipe
-from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.core.observations import DepthTraits, View
 from lerobot_msdyn.priors import PointTracks, Priors
-from lerobot_msdyn.reconstruct.reconstruct import reconstruct
-from lerobot_msdyn.reconstruct.self_check import (
-    Witness,
+from lerobot_msdyn.reconstruction.reconstruct import reconstruct
+from lerobot_msdyn.reconstruction.result import Reconstruction
+from lerobot_msdyn.reconstruction.self_check import (
+    SelfCheck,
     decibels,
     flicker,
     sharpness,
@@ -23,9 +24,9 @@ from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.views.expected_error import expected_error
 from lerobot_msdyn.views.gate import Scores, judge, reasons, record
 from lerobot_msdyn.views.perturbation import orbit_offset
-from lerobot_msdyn.views.pictures import Reconstruction
 
 FRAMES, WIDTH, HEIGHT = 30, 64, 48
+HELD_OUT = [7, 14, 22]  # of so many frames, by the default number
 
 
 @pytest.fixture(scope="module")
@@ -56,15 +57,15 @@ def score(scene: Reconstruction, degrees: float) -> Scores:
 
 
 def test_witnesses_are_frames_that_were_not_fitted(scene: Reconstruction) -> None:
-    witness = scene.witnesses[0]
-    assert witness.held_out
-    assert witness.frames.tolist() == scene.results[0].held_out.tolist()
-    assert len(witness.frames) == 3
-    assert 15 < decibels(float(witness.fitted_error.mean())) < 50
-    assert witness.error.mean() < witness.fitted_error.mean(), "new views are drawn with the overlay"
-    assert witness.moving_error > witness.fitted_error.mean()
-    assert witness.depth_error == pytest.approx(0.01, abs=0.002)
-    assert 0 < witness.track_px < GateConfig().max_track_px
+    self_check = scene.windows[0].self_check
+    assert self_check.held_out
+    assert self_check.frames.tolist() == HELD_OUT
+    assert len(self_check.frames) == 3
+    assert 15 < decibels(float(self_check.fitted_error.mean())) < 50
+    assert self_check.error.mean() < self_check.fitted_error.mean(), "new views are drawn with the overlay"
+    assert self_check.moving_error > self_check.fitted_error.mean()
+    assert self_check.depth_error == pytest.approx(0.01, abs=0.002)
+    assert 0 < self_check.track_px < GateConfig().max_track_px
 
 
 def test_short_videos_have_witnesses_too(pushed: View) -> None:
@@ -92,12 +93,12 @@ def test_a_scene_that_was_hardly_fitted_is_expected_to_be_worse(pushed: View, sc
 
 
 def test_depth_that_disagrees_with_the_scene_is_expected_to_be_worse(scene: Reconstruction) -> None:
-    witness = scene.witnesses[0]
-    new = turned(witness.camera, 15, scene.distance)
-    wrong = dataclasses.replace(witness, depth=witness.depth * 1.2)
-    assert expected_error(wrong, new).geometry.mean() > 2 * expected_error(witness, new).geometry.mean()
-    rough = dataclasses.replace(witness, depth_error=0.1)
-    assert expected_error(rough, new).depth.mean() > 3 * expected_error(witness, new).depth.mean()
+    self_check = scene.windows[0].self_check
+    new = turned(self_check.camera, 15, scene.distance)
+    wrong = dataclasses.replace(self_check, depth=self_check.depth * 1.2)
+    assert expected_error(wrong, new).geometry.mean() > 2 * expected_error(self_check, new).geometry.mean()
+    rough = dataclasses.replace(self_check, depth_error=0.1)
+    assert expected_error(rough, new).depth.mean() > 3 * expected_error(self_check, new).depth.mean()
 
 
 def test_depth_that_is_not_steady_is_known_to_be_wrong() -> None:
@@ -108,7 +109,7 @@ def test_depth_that_is_not_steady_is_known_to_be_wrong() -> None:
     depth[:, :4] = torch.rand(20, 4, 16, generator=generator) + 0.5
     nothing = torch.zeros(0, 20)
     tracks = PointTracks(torch.zeros(0, 20, 2), nothing.bool(), nothing, torch.zeros(0).long())
-    steady = Priors(depth, instances, tracks, metric=True)
+    steady = Priors(depth, instances, tracks, DepthTraits(metric=True))
     assert unsteadiness(steady) == pytest.approx(0, abs=1e-6)
     noise = torch.exp(0.03 * torch.randn(20, 1, 1, generator=generator))
     assert unsteadiness(dataclasses.replace(steady, depth=depth * noise)) == pytest.approx(0.03, rel=0.4)
@@ -116,16 +117,16 @@ def test_depth_that_is_not_steady_is_known_to_be_wrong() -> None:
 
 
 def test_unknown_depth_is_nothing_to_disagree_with(scene: Reconstruction) -> None:
-    witness = scene.witnesses[0]
-    unknown = dataclasses.replace(witness, depth=torch.zeros_like(witness.depth))
-    found = expected_error(unknown, turned(witness.camera, 15, scene.distance))
+    self_check = scene.windows[0].self_check
+    unknown = dataclasses.replace(self_check, depth=torch.zeros_like(self_check.depth))
+    found = expected_error(unknown, turned(self_check.camera, 15, scene.distance))
     assert found.geometry.tolist() == pytest.approx([0.0, 0.0, 0.0], abs=1e-9)
     assert torch.isfinite(found.total).all()
 
 
 def test_errors_by_cause_add_up(scene: Reconstruction) -> None:
-    witness: Witness = scene.witnesses[0]
-    found = expected_error(witness, turned(witness.camera, 8, scene.distance))
+    self_check: SelfCheck = scene.windows[0].self_check
+    found = expected_error(self_check, turned(self_check.camera, 8, scene.distance))
     assert sum(found.shares.values()) == pytest.approx(1, abs=1e-5)
     assert found.psnr_db == pytest.approx(decibels(float(found.total.mean())))
 
@@ -163,7 +164,7 @@ def test_the_verdict_says_why(scene: Reconstruction) -> None:
 
 def test_the_record_holds_plain_values(scene: Reconstruction) -> None:
     found = record(score(scene, 10))
-    assert [frame["frame"] for frame in found["frames"]] == scene.witnesses[0].frames.tolist()
+    assert [frame["frame"] for frame in found["frames"]] == scene.windows[0].self_check.frames.tolist()
     assert len(found["heat"]) == 18
     assert all(0 <= value <= 100 for row in found["heat"] for value in row)
     assert set(found["causes"]) == {"video", "geometry", "depth", "sampling"}

@@ -8,11 +8,12 @@ import torch
 
 from lerobot_msdyn.core.config import PosesConfig, Recipe, TranslationConfig
 from lerobot_msdyn.core.errors import ConfigError
-from lerobot_msdyn.dataset.read import View
-from lerobot_msdyn.reconstruct.reconstruct import reconstruct
+from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.reconstruction.reconstruct import reconstruct
+from lerobot_msdyn.reconstruction.result import Reconstruction
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.views.new_cameras import SMALLEST, covered_rectangle, largest_factor, new_cameras
-from lerobot_msdyn.views.pictures import Reconstruction, coverages
+from lerobot_msdyn.views.pictures import coverages
 
 
 @pytest.fixture(scope="module")

@@ -21,13 +21,13 @@ from lerobot_msdyn.core.config import (
 )
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.core.geometry import invert_se3, transform_points
+from lerobot_msdyn.reconstruction.background import look_at_distance
 from lerobot_msdyn.views.perturbation import (
     AMOUNTS,
     Viewpoint,
     amounts_of,
     described,
     draw,
-    look_at_distance,
     moved,
     offsets,
     orbit_offset,

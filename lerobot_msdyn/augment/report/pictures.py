@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Int, UInt8
 from numpy import ndarray
 
+from lerobot_msdyn.core.sampling import evenly
+
 CLIP_FRAMES = 12
 STRIP_FRAMES = 5
 CLIP_WIDTH = 240  # px, of one picture
@@ -26,7 +28,7 @@ def data_url(picture: UInt8[ndarray, "h w 3"]) -> str:
 
 def spread(total: int, count: int) -> Int[ndarray, " n"]:
     """At most `count` of `total` frames, evenly spread."""
-    return np.unique(np.linspace(0, total - 1, min(count, total)).round().astype(int))
+    return evenly(total, count).numpy()
 
 
 def strip(before: Sequence[ndarray], after: Sequence[ndarray]) -> UInt8[ndarray, "h w 3"]:

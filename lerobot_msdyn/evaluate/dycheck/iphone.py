@@ -27,9 +27,9 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.core.config import Protocol
 from lerobot_msdyn.core.errors import DatasetError
-from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.evaluate.config import Protocol
 from lerobot_msdyn.priors.hub import demand_library
 
 FACTOR: dict[Protocol, int] = {"som": 1, "dycheck": 2}  # by which pictures are smaller than the recorded ones

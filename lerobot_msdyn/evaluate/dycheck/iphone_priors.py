@@ -10,6 +10,7 @@ from jaxtyping import Float32, UInt8
 from numpy import ndarray
 
 from lerobot_msdyn.core.errors import DatasetError
+from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.evaluate.dycheck.iphone import PROCESSED, IphoneSequence, read_array, read_picture
 from lerobot_msdyn.priors.exchange import Exchange
 
@@ -57,7 +58,7 @@ def _tracks(folder: Path, names: Sequence[str]) -> dict[str, ndarray]:
     and of being off. A point is seen where (1 - hidden) (1 - off) > 0.5.
     """
     positions, seen, sure, asked = [], [], [], []
-    for query in np.unique(np.linspace(0, len(names) - 1, QUERY_FRAMES).round().astype(int)).tolist():
+    for query in evenly(len(names), QUERY_FRAMES).tolist():
         files = [read_array(folder / f"{names[query]}_{name}.npy").astype(np.float32) for name in names]
         if len({file.shape for file in files}) > 1 or files[0].ndim != 2 or files[0].shape[1] != 4:
             raise DatasetError(f"{folder}/{names[query]}_*.npy: files of tracks differ in shape, or are not [n, 4]")

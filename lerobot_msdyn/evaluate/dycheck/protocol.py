@@ -14,7 +14,7 @@ import torch
 from jaxtyping import UInt8
 from numpy import ndarray
 
-from lerobot_msdyn.core.config import DycheckConfig
+from lerobot_msdyn.evaluate.config import DycheckConfig
 from lerobot_msdyn.evaluate.dycheck.iphone import IphoneSequence, read_sequence
 from lerobot_msdyn.evaluate.dycheck.iphone_priors import read_priors
 from lerobot_msdyn.evaluate.metrics import masked_psnr_db, partial_ssim
@@ -22,7 +22,8 @@ from lerobot_msdyn.evaluate.perceptual import SpatialNetwork, lpips_network, mas
 from lerobot_msdyn.evaluate.scores import Evaluated, Scores, mean_scores, score_table
 from lerobot_msdyn.evaluate.timing import timed, timed_reconstruction
 from lerobot_msdyn.priors.exchange import write_exchange
-from lerobot_msdyn.views.pictures import Reconstruction, new_pictures
+from lerobot_msdyn.reconstruction.result import Reconstruction
+from lerobot_msdyn.views.pictures import new_pictures
 
 PRIORS_FILE = "priors.npz"
 

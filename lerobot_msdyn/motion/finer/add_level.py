@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lerobot_msdyn.core.config import LevelName, MotionConfig
+from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.motion.finer.residual import (
     ResidualTracks,
     cluster_places,
@@ -186,7 +187,7 @@ def _prediction(
     frames = seen.valid.shape[1]
     times = torch.arange(0, frames, -(-frames // _JUDGED_FRAMES))
     without_it, with_it, count = torch.zeros(3, len(rows))
-    for frame in torch.linspace(0, frames - 1, _QUERY_FRAMES).round().long().unique().tolist():
+    for frame in evenly(frames, _QUERY_FRAMES).tolist():
         here = (tracks.weights[rows, frame] > 0).nonzero()[:, 0]
         who = rows[here]
         weights = tracks.weights[who][:, times] * ((times - frame).abs() > _QUERY_REACH)

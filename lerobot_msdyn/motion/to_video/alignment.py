@@ -10,6 +10,7 @@ from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.geometry import invert_se3, transform_points, unproject
+from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.motion.from_tracks.lift import near_depth_edge
 from lerobot_msdyn.motion.to_video.kernels import OUTSIDE_UNIT, REACH_PX, Maps, Points, align_poses, frame_costs
 
@@ -89,7 +90,7 @@ def sight(video: Video, frames: list[int], most: int) -> Sightings:
         labels = video.instances[t]
         inner = cv2.erode((labels > 0).numpy().astype(np.uint8), window) > 0
         rows = np.argwhere(inner & video.maps.known[t])
-        rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).round().astype(int)]
+        rows = rows[evenly(len(rows), most).numpy()]
         row, column = torch.from_numpy(rows).unbind(-1)
         depth = torch.from_numpy(video.maps.depth[t])
         pose = video.camera.world_from_camera[t]

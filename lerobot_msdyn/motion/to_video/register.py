@@ -11,6 +11,7 @@ from torch import Tensor
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.config import LevelName, MotionConfig
 from lerobot_msdyn.core.geometry import invert_se3, quaternion_to_matrix, se3, transform_points
+from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.motion.model.bases import MotionLevel, level_affines, level_from_motions
 from lerobot_msdyn.motion.model.scene_motion import SceneMotion
 from lerobot_msdyn.motion.to_video.alignment import Sightings, Video, centres, costs_in_camera, read_video, sight
@@ -44,7 +45,7 @@ class Recording:
         if len(seen) == 0:
             return None
         video = read_video(rgb, depth, instances, camera, float(seen.median() / camera.intrinsics[0, 0, 0]))
-        spread = torch.linspace(0, len(rgb) - 1, 2 * _MODEL_FRAMES - 1).round().long().unique().tolist()
+        spread = evenly(len(rgb), 2 * _MODEL_FRAMES - 1).tolist()
         return cls(video, sight(video, spread[::2], _POINTS), sight(video, spread[1::2], _JUDGES))
 
     def register(self, motion: SceneMotion, config: MotionConfig) -> SceneMotion:
@@ -78,7 +79,7 @@ class Recording:
 
     def costs(self, motion: SceneMotion) -> tuple[Float[Tensor, " n"], Int[Tensor, " n"]]:
         """How badly each judge fits the clip when a motion carries it (0 to 1), and the part that it follows."""
-        frames = torch.linspace(0, len(self.video) - 1, _JUDGED_FRAMES).round().long().unique()
+        frames = evenly(len(self.video), _JUDGED_FRAMES)
         view = self.video.camera.camera_from_world[frames]
         points, part = _traced(motion, self.judges)
         moved, turns = motion.moved(points, part, torch.cat((frames, self.judges.frame.unique())))

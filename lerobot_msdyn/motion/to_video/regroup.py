@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.motion.to_video.alignment import Sightings, Video, align, carried_costs
 
 _JUDGED_FRAMES = 24  # in which points are compared with the video
@@ -69,7 +70,7 @@ def _neighbours(points: Sightings) -> Int[Tensor, "n j"]:
 
 def _costs(video: Video, points: Sightings, found: Grouping, neighbours: Int[Tensor, "n j"]) -> Float[Tensor, "n k"]:
     """Cost of each point in each part, smoothed over its neighbours; infinite in parts of other instances."""
-    frames = torch.linspace(0, len(video) - 1, _JUDGED_FRAMES).round().long().unique()
+    frames = evenly(len(video), _JUDGED_FRAMES)
     costs = carried_costs(video, points, found.motions, frames)
     for _ in range(_SPREADS):
         costs = (costs + costs[neighbours].mean(1)) / 2

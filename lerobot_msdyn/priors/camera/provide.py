@@ -10,7 +10,7 @@ from torch import Tensor
 from lerobot_msdyn.core.cameras import CameraTrack, intrinsics_from_fov
 from lerobot_msdyn.core.errors import PriorError
 from lerobot_msdyn.core.geometry import invert_se3
-from lerobot_msdyn.core.observations import Origin, PointTracks
+from lerobot_msdyn.core.observations import DepthTraits, Origin, PointTracks
 from lerobot_msdyn.priors.camera.field_of_view import fov_from_rigid_motion
 from lerobot_msdyn.priors.camera.sfm import camera_from_sfm
 from lerobot_msdyn.priors.camera.steadiness import FIXED_PX, SWAY_PX, camera_motion_px
@@ -66,14 +66,14 @@ def _from_file(request: Request, pattern: str) -> tuple[CameraTrack, Origin]:
 
 
 def with_searched_fov(
-    camera: CameraTrack, tracks: PointTracks, depth: Float[Tensor, "t h w"], depth_provider: str
+    camera: CameraTrack, tracks: PointTracks, depth: Float[Tensor, "t h w"], traits: DepthTraits
 ) -> tuple[CameraTrack, Origin]:
     """The camera with the field of view at which rigid things keep their size.
 
     Raises:
         PriorError: the depth is that of an assumed plane, or nothing turns enough to tell.
     """
-    if depth_provider == "plane":
+    if traits.assumed:
         raise PriorError(
             "camera.fov_search needs depth that does not depend on the field of view: recorded, learned or from a file"
         )

@@ -15,7 +15,8 @@ from torch import Tensor
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.errors import PriorError
 from lerobot_msdyn.core.geometry import matrix_to_quaternion, quaternion_to_matrix
-from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.priors.camera.steadiness import FIXED_PX, camera_motion_px
 from lerobot_msdyn.priors.hub import demand_library
 
@@ -39,7 +40,7 @@ def camera_from_sfm(view: View, instances: UInt8[Tensor, "t h w"]) -> CameraTrac
             f"camera.poses is 'sfm', but the camera does not move ({motion:.2f} px): there is no parallax to "
             "reconstruct from; use --camera.poses auto"
         )
-    frames = np.linspace(0, len(view.rgb) - 1, min(len(view.rgb), _MAX_FRAMES)).round().astype(int)
+    frames = evenly(len(view), _MAX_FRAMES).numpy()
     with tempfile.TemporaryDirectory(prefix="lerobot_msdyn_sfm_") as name:
         folder = Path(name)
         _write_images(folder, view, instances, frames)

@@ -6,6 +6,8 @@ from jaxtyping import Bool, Float32, UInt8
 from numpy import ndarray
 from torch import Tensor
 
+from lerobot_msdyn.core.sampling import evenly
+
 FIXED_PX = 0.5  # a camera whose picture moves less is fixed
 SWAY_PX = 3.0  # up to this it is taken as fixed; the masks allow for such a sway
 _PAIRS = 20  # pairs of frames that are looked at, evenly spread
@@ -19,7 +21,7 @@ def camera_motion_px(rgb: UInt8[Tensor, "t h w 3"], moving: Bool[Tensor, "t h w"
 
     Where too few features can be followed, phase correlation of the whole pictures decides.
     """
-    frames = np.linspace(0, len(rgb) - 1, min(len(rgb), _PAIRS + 1)).round().astype(int)
+    frames = evenly(len(rgb), _PAIRS + 1).numpy()
     grey = [cv2.cvtColor(rgb[int(frame)].numpy(), cv2.COLOR_RGB2GRAY) for frame in frames]
     masks = [_usable(moving, int(frame), grey[0].shape) for frame in frames]
     motions = [_motion_px(grey[i], grey[i + 1], masks[i]) for i in range(len(frames) - 1)]

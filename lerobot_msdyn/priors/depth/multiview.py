@@ -11,7 +11,7 @@ from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.errors import PriorError
-from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.priors.depth.flying_pixels import without_flying_pixels
 from lerobot_msdyn.priors.depth.stereo import RectifiedPair, relative_pose
 from lerobot_msdyn.priors.depth.triangulate import (

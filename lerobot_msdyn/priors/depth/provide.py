@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from lerobot_msdyn.core.errors import PriorError
-from lerobot_msdyn.core.observations import Origin
+from lerobot_msdyn.core.observations import DepthTraits, Origin
 from lerobot_msdyn.priors.cache import digest_of
 from lerobot_msdyn.priors.depth.align import align_disparity, align_scale
 from lerobot_msdyn.priors.depth.blurred_edges import sharpened
@@ -17,12 +17,16 @@ from lerobot_msdyn.priors.depth.depth_anything import predict_depth
 from lerobot_msdyn.priors.depth.flying_pixels import clean_recorded_depth, without_flying_pixels
 from lerobot_msdyn.priors.depth.multiview import multiview_depth, usable_partners, why_no_partner
 from lerobot_msdyn.priors.depth.table_plane import table_plane_depth
-from lerobot_msdyn.priors.hub import LocalModel, demand_model, find_model, has_library
+from lerobot_msdyn.priors.hub import LocalModel, demand_model, find_model, has_library, learned_origin
 from lerobot_msdyn.priors.masks.provide import file_origin
 from lerobot_msdyn.priors.request import FILE, Candidate, Request, first_that_works
 
-type Depth = tuple[Float[Tensor, "t h w"], bool]  # m, 0 = unknown; whether metres are true
+type Depth = tuple[Float[Tensor, "t h w"], DepthTraits]  # m, 0 = unknown
 type Found = tuple[Depth, Origin]
+
+RECORDED = DepthTraits(metric=True, sharp=True, relative_error=0.01)
+STEREO = DepthTraits(metric=True, relative_error=0.02)
+PLANE = DepthTraits(sharp=True, relative_error=0.10, assumed=True)
 
 
 def provide_depth(request: Request, instances: UInt8[Tensor, "t h w"]) -> Found:
@@ -86,14 +90,14 @@ def _recorded(request: Request, why: str) -> Found:
             f"the recorded depth of {request.key or 'the camera'} holds no measurement in any of its "
             f"{len(depth)} frames (all 0 or out of range); use --priors.depth plane"
         )
-    return (depth, True), Origin("recorded", why)
+    return (depth, RECORDED), Origin("recorded", why)
 
 
 def _plane(request: Request, instances: UInt8[Tensor, "t h w"], why: str) -> Found:
     camera = request.camera
     depth = table_plane_depth(instances, request.view.camera.intrinsics[0], camera.height_m, camera.tilt_deg)
     seen = f"a table seen from {camera.height_m:g} m at {camera.tilt_deg:g} degrees"
-    return (depth, False), Origin("plane", f"{seen}; {why}")
+    return (depth, PLANE), Origin("plane", f"{seen}; {why}")
 
 
 def _stereo(request: Request, instances: UInt8[Tensor, "t h w"], why: str) -> Found:
@@ -115,7 +119,7 @@ def _stereo(request: Request, instances: UInt8[Tensor, "t h w"], why: str) -> Fo
     }
     found = request.cache.get("depth", "stereo", settings, compute)
     why = f"with {len(partners)} other camera{'s' if len(partners) > 1 else ''}; {why}"
-    return (torch.from_numpy(found["depth"].astype(np.float32)), True), Origin("stereo", why)
+    return (torch.from_numpy(found["depth"].astype(np.float32)), STEREO), Origin("stereo", why)
 
 
 def _learned(request: Request, instances: UInt8[Tensor, "t h w"], provider: str, model: LocalModel, why: str) -> Found:
@@ -130,7 +134,7 @@ def _learned(request: Request, instances: UInt8[Tensor, "t h w"], provider: str,
     if (kind == "metric") != (provider == "depth_anything_metric"):
         raise PriorError(f"priors.depth is {provider!r}, but {model.name} predicts {kind.replace('_', ' ')}")
     depth, true_metres, how = _scaled(request, instances, values, kind, file=False)
-    return (_clean(depth), true_metres), Origin.learned(provider, model, f"{why}; {how}")
+    return (_clean(depth), DepthTraits(true_metres)), learned_origin(provider, model, f"{why}; {how}")
 
 
 def _from_file(request: Request, instances: UInt8[Tensor, "t h w"], pattern: str) -> Found:
@@ -141,7 +145,7 @@ def _from_file(request: Request, instances: UInt8[Tensor, "t h w"], pattern: str
     depth, true_metres, how = _scaled(request, instances, values, content.depth_kind, file=True)
     origin = file_origin(content.provenance.get("depth"), pattern)
     why = f"{origin.why}, {content.depth_kind}; {how}"
-    return (_clean(depth), true_metres), Origin("file", why, origin.model, origin.revision, origin.licence)
+    return (_clean(depth), DepthTraits(true_metres)), Origin("file", why, origin.model, origin.revision, origin.licence)
 
 
 def _clean(depth: Float[Tensor, "t h w"]) -> Float[Tensor, "t h w"]:
@@ -159,8 +163,9 @@ def _scaled(
     """
     if kind == "metric" and file:
         return torch.where(torch.isfinite(values), values, 0.0).clamp(min=0), True, "in metres"
-    (reference, true_metres), origin = _reference(request, instances)
-    usable = None if origin.provider == "recorded" else instances == 0
+    (reference, traits), origin = _reference(request, instances)
+    true_metres = traits.metric
+    usable = None if traits.measured else instances == 0
     if kind == "affine_disparity":
         return align_disparity(values, reference, usable), true_metres, f"scaled and shifted to {origin.provider}"
     if kind == "metric" and not true_metres:

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float32, Int, UInt8
 from numpy import ndarray
 from torch import Tensor
 
+from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.priors.boxes import box_about
 from lerobot_msdyn.priors.camera.steadiness import SWAY_PX, camera_motion_px
 from lerobot_msdyn.priors.masks.change import Colours, Reference, along_edges, changes, to_lab
@@ -121,7 +122,7 @@ def _spread(frames: ndarray, most: int) -> ndarray:
 
 
 def _spread_index(frames: int, most: int) -> Int[ndarray, " s"]:
-    return np.linspace(0, frames - 1, min(frames, most)).round().astype(int)
+    return evenly(frames, most).numpy()
 
 
 def _moving_pixels(

@@ -9,7 +9,7 @@ from torch import Tensor
 from lerobot_msdyn.core.errors import PriorError
 from lerobot_msdyn.core.observations import Origin
 from lerobot_msdyn.priors.cache import digest_of
-from lerobot_msdyn.priors.hub import LocalModel, demand_model, find_model, has_companion, has_library
+from lerobot_msdyn.priors.hub import LocalModel, demand_model, find_model, has_companion, has_library, learned_origin
 from lerobot_msdyn.priors.masks.moving import moving_instances, temporal_median
 from lerobot_msdyn.priors.masks.sam2 import sam2_masks
 from lerobot_msdyn.priors.request import FILE, Candidate, Request, first_that_works
@@ -74,7 +74,7 @@ def _learned(request: Request, provider: str, model: LocalModel, why: str) -> tu
 
     settings = {"model": model.name, "revision": model.revision}
     found = request.cache.get("masks", provider, settings, compute)
-    return torch.from_numpy(found["masks"]), Origin.learned(provider, model, why)
+    return torch.from_numpy(found["masks"]), learned_origin(provider, model, why)
 
 
 def _from_file(request: Request, pattern: str) -> tuple[Masks, Origin]:

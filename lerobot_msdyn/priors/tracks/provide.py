@@ -12,7 +12,7 @@ from torch import Tensor
 from lerobot_msdyn.core.errors import PriorError
 from lerobot_msdyn.core.observations import Origin, PointTracks
 from lerobot_msdyn.priors.cache import digest_of
-from lerobot_msdyn.priors.hub import LocalModel
+from lerobot_msdyn.priors.hub import LocalModel, learned_origin
 from lerobot_msdyn.priors.masks.provide import file_origin
 from lerobot_msdyn.priors.request import FILE, Candidate, Request, first_that_works
 from lerobot_msdyn.priors.tracks.flow import flow_tracks
@@ -60,7 +60,7 @@ def _flow(
         settings["weights"] = hashlib.sha256(model.folder.read_bytes()).hexdigest()
     found = request.cache.get("tracks", provider, settings, compute)
     tracks = PointTracks(**{name: torch.from_numpy(value) for name, value in found.items()})
-    origin = Origin(provider, why) if model is None else Origin.learned(provider, model, why)
+    origin = Origin(provider, why) if model is None else learned_origin(provider, model, why)
     return tracks, origin
 
 

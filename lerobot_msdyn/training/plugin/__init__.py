@@ -19,8 +19,8 @@ from typing import Any
 from lerobot.datasets import EpisodeAwareSampler, StreamingLeRobotDataset, factory
 
 from lerobot_msdyn.core.cli import load_recipe, parse_config
-from lerobot_msdyn.core.config import MixedViewsConfig
 from lerobot_msdyn.core.errors import ConfigError
+from lerobot_msdyn.training.config import MixedViewsConfig
 from lerobot_msdyn.training.mixed import MixedViews
 from lerobot_msdyn.training.streamed import MixedStream
 

@@ -13,10 +13,11 @@ from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.priors.depth.flying_pixels import clean_recorded_depth
 from lerobot_msdyn.priors.masks.moving import temporal_median
-from lerobot_msdyn.reconstruct.background import MARGIN_PX, SAMPLES, EmptyScene, empty_scene
+from lerobot_msdyn.reconstruction.background import MARGIN_PX, SAMPLES, EmptyScene, empty_scene
 from lerobot_msdyn.scene.gaussians import Gaussians, rgb_to_sh
 
 logger = logging.getLogger(__name__)
@@ -91,9 +92,7 @@ def pooled(views: list[View], numbers: list[int], moving: MovingIn) -> SharedBac
 
 def few_frames(view: View) -> View:
     """Some evenly spread frames of a video."""
-    some = few(len(view.rgb))
-    depth = None if view.depth is None else view.depth[some]
-    return View(view.rgb[some], view.camera.select(some), depth, view.depth_range)
+    return view.select(torch.tensor(few(len(view))))
 
 
 def completed(own: EmptyScene, shared: EmptyScene, frames: int) -> EmptyScene:
@@ -209,4 +208,4 @@ def from_arrays(arrays: dict[str, ndarray], camera: CameraTrack, frames: UInt8[T
 
 def few(frames: int) -> list[int]:
     """Evenly spread frames of a video of so many."""
-    return sorted(set(np.linspace(0, frames - 1, min(frames, FRAMES_EACH)).round().astype(int).tolist()))
+    return evenly(frames, FRAMES_EACH).tolist()

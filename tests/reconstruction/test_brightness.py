@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from lerobot_msdyn.core.cameras import intrinsics_from_fov, static_camera
-from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.core.observations import DepthTraits, View
 from lerobot_msdyn.motion.model.bases import identity_level
 from lerobot_msdyn.priors import PointTracks, Priors
-from lerobot_msdyn.reconstruct.background import background_gaussians, pixel_gaussians
-from lerobot_msdyn.reconstruct.brightness import moving_gain, static_shading
+from lerobot_msdyn.reconstruction.background import background_gaussians, pixel_gaussians
+from lerobot_msdyn.reconstruction.brightness import moving_gain, static_shading
 from lerobot_msdyn.scene.gaussians import DynamicScene
 from lerobot_msdyn.scene.shading import decode_gain
 
@@ -34,7 +34,7 @@ def scene() -> tuple[DynamicScene, View, Priors]:
     level = identity_level(torch.zeros(1, 3), FRAMES)
     rows = torch.zeros(len(moving), 1)
     drawn = DynamicScene(static, moving, (level,), (rows.long(),), (rows,), FRAMES)
-    return drawn, View(rgb, camera), Priors(depth, instances, none, metric=True)
+    return drawn, View(rgb, camera), Priors(depth, instances, none, DepthTraits(metric=True))
 
 
 def test_a_change_of_exposure_is_found_also_behind_what_moves(scene: tuple[DynamicScene, View, Priors]) -> None:

@@ -5,11 +5,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from lerobot_msdyn.augment.backgrounds import shared_backgrounds
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import PriorError
 from lerobot_msdyn.dataset.read import open_source
-from lerobot_msdyn.reconstruct import share_background as sharing
-from lerobot_msdyn.reconstruct.share_background import shared_backgrounds, windows
+from lerobot_msdyn.reconstruction import share_background as sharing
+from lerobot_msdyn.reconstruction.windows import windows
 
 FRONT = "observation.images.front"
 

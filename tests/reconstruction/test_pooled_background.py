@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from lerobot_msdyn.core.cameras import intrinsics_from_fov, static_camera
-from lerobot_msdyn.dataset.read import View
-from lerobot_msdyn.reconstruct.background import EmptyScene, background_gaussians, empty_scene
-from lerobot_msdyn.reconstruct.pooled_background import (
+from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.reconstruction.background import EmptyScene, background_gaussians, empty_scene
+from lerobot_msdyn.reconstruction.pooled_background import (
     MovingIn,
     SharedBackground,
     adapted,

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lerobot_msdyn.reconstruct.losses import certain_pixels, depth_loss, mask_loss, rgb_loss
+from lerobot_msdyn.reconstruction.losses import certain_pixels, depth_loss, mask_loss, rgb_loss
 
 
 def test_rgb_is_the_mean_absolute_difference() -> None:

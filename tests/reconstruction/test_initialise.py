@@ -8,13 +8,13 @@ import torch
 from lerobot_msdyn.core.cameras import intrinsics_from_fov, static_camera
 from lerobot_msdyn.core.config import MotionConfig, SceneConfig
 from lerobot_msdyn.core.geometry import axis_angle_to_matrix, quaternion_to_matrix, se3, unproject
-from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.core.observations import DepthTraits, View
 from lerobot_msdyn.motion.model.bases import identity_level, level_from_motions
 from lerobot_msdyn.motion.model.scene_motion import SceneMotion
 from lerobot_msdyn.priors import PointTracks, Priors
-from lerobot_msdyn.reconstruct.background import pixel_gaussians
-from lerobot_msdyn.reconstruct.fit import psnr
-from lerobot_msdyn.reconstruct.initialise import contradicted, initialise, merge_voxels, to_canonical
+from lerobot_msdyn.reconstruction.background import pixel_gaussians
+from lerobot_msdyn.reconstruction.fit import psnr
+from lerobot_msdyn.reconstruction.initialise import contradicted, initialise, merge_voxels, to_canonical
 from lerobot_msdyn.scene.gaussians import DynamicScene, gaussians_from_points
 from lerobot_msdyn.synthetic import make_scene
 
@@ -31,7 +31,7 @@ def pushed() -> tuple[View, Priors]:
         seen.depth,
         seen.instances,
         PointTracks(tracks.xy, tracks.visible, tracks.visible.float(), tracks.instance),
-        metric=True,
+        DepthTraits(metric=True),
     )
     return View(seen.rgb, scene.camera, seen.depth), priors
 
@@ -134,7 +134,7 @@ def test_points_in_front_of_what_stands_still_are_contradicted() -> None:
     nothing = PointTracks(
         torch.zeros(0, 4, 2), torch.zeros(0, 4, dtype=torch.bool), torch.zeros(0, 4), torch.zeros(0, dtype=torch.long)
     )
-    priors = Priors(depth, instances, nothing, metric=True)
+    priors = Priors(depth, instances, nothing, DepthTraits(metric=True))
     xy = torch.tensor([[15.0, 15.0], [30.0, 15.0], [30.0, 15.0], [-9.0, 15.0]])
     z = torch.tensor([0.9, 0.9, 1.1, 0.9])  # on the mask; in front of the wall; behind it; outside the image
     points = unproject(xy, z, camera.intrinsics[0])

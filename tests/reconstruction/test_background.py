@@ -8,7 +8,7 @@ import torch
 from lerobot_msdyn.core.cameras import CameraTrack, intrinsics_from_fov, static_camera
 from lerobot_msdyn.core.geometry import project, quaternion_to_matrix, transform_points, unproject_image
 from lerobot_msdyn.motion.model.bases import identity_level
-from lerobot_msdyn.reconstruct.background import (
+from lerobot_msdyn.reconstruction.background import (
     background_gaussians,
     empty_scene,
     fill_depth,

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 import torch
 
+from lerobot_msdyn.augment.episode import by_feature
 from lerobot_msdyn.core.config import Recipe
-from lerobot_msdyn.dataset.read import View, open_source
+from lerobot_msdyn.core.observations import DepthTraits, View
+from lerobot_msdyn.dataset.read import open_source
 from lerobot_msdyn.priors import Priors, estimate_priors
-from lerobot_msdyn.reconstruct import reconstruct as pipeline
-from lerobot_msdyn.reconstruct.reconstruct import Picture, by_feature, new_pictures, reconstruct
+from lerobot_msdyn.reconstruction import reconstruct as pipeline
+from lerobot_msdyn.reconstruction.reconstruct import Picture, new_pictures, reconstruct
 from lerobot_msdyn.synthetic import make_scene
 
 FRAMES, WIDTH, HEIGHT = 12, 64, 48
@@ -113,7 +115,8 @@ def test_windows_whose_priors_differ_say_so(pushed: View, monkeypatch: pytest.Mo
     def estimated(*arguments: Any, **named: Any) -> Priors:
         priors, metric = estimate_priors(*arguments, **named), next(known)
         depth = {"provider": "recorded" if metric else "plane", "why": "of this test"}
-        return dataclasses.replace(priors, metric=metric, provenance=priors.provenance | {"depth": depth})
+        traits = DepthTraits(metric=metric)
+        return dataclasses.replace(priors, depth_traits=traits, provenance=priors.provenance | {"depth": depth})
 
     monkeypatch.setattr(pipeline, "estimate_priors", estimated)
     settings = recipe()
@@ -128,8 +131,8 @@ def test_a_long_video_is_fitted_in_windows(pushed: View) -> None:
     settings = recipe()
     settings.fit.window_frames = 5
     found = reconstruct(pushed, settings)
-    assert found.starts == (0, 4, 8)
-    assert [result.scene.frames for result in found.results] == [4, 4, 4]
+    assert [window.start for window in found.windows] == [0, 4, 8]
+    assert [window.scene.frames for window in found.windows] == [4, 4, 4]
     check(pushed, settings)
     frames = torch.tensor([7, 0, 9])
     whole = list(new_pictures(found, pushed.camera))

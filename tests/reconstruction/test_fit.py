@@ -8,11 +8,11 @@ import torch
 from lerobot_msdyn.core.cameras import intrinsics_from_fov, static_camera
 from lerobot_msdyn.core.config import FitConfig, LearningRates
 from lerobot_msdyn.core.errors import EpisodeError
-from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.core.observations import DepthTraits, View
 from lerobot_msdyn.motion.model.bases import identity_level
 from lerobot_msdyn.priors import PointTracks, Priors
-from lerobot_msdyn.reconstruct.background import background_gaussians
-from lerobot_msdyn.reconstruct.fit import FitResult, fit, psnr
+from lerobot_msdyn.reconstruction.background import background_gaussians
+from lerobot_msdyn.reconstruction.fit import FitResult, fit, psnr
 from lerobot_msdyn.scene.gaussians import DynamicScene
 
 WIDTH, HEIGHT, FRAMES = 32, 24, 3
@@ -31,7 +31,7 @@ def still_video() -> tuple[View, Priors]:
         torch.zeros(0, dtype=torch.long),
     )
     instances = torch.zeros(FRAMES, HEIGHT, WIDTH, dtype=torch.uint8)
-    return View(rgb, camera), Priors(torch.ones(FRAMES, HEIGHT, WIDTH), instances, nothing, metric=True)
+    return View(rgb, camera), Priors(torch.ones(FRAMES, HEIGHT, WIDTH), instances, nothing, DepthTraits(metric=True))
 
 
 def grey_scene(view: View) -> DynamicScene:

@@ -16,21 +16,23 @@ from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.geometry import project, transform_points
+from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.core.serialise import to_device
-from lerobot_msdyn.dataset.read import View
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.scene.draw import draw
 from lerobot_msdyn.scene.gaussians import DynamicScene
 
-WITNESSES = 3  # frames that are looked at where none was held out
+CHECKED_FRAMES = 3  # frames that are looked at where none was held out
 STILL_PX = 5  # side of the square around a pixel in which nothing may move for it to stand still
 TRACKED = 400  # points, at most, of which the residual is measured
 SSIM_WINDOW = 11
+TRACK_FRAMES = 12  # in which they are looked for
 DEPTH_FRAMES = 12  # at which the depth of what stands still is compared with itself
 
 
 @dataclass(frozen=True)
-class Witness:
+class SelfCheck:
     """A few recorded frames, and what the scene says of them; all at the size at which the scene was fitted."""
 
     frames: Int[Tensor, " t"]  # of the scene
@@ -54,14 +56,14 @@ def decibels(error: float) -> float:
 
 
 @torch.no_grad()
-def witness(scene: DynamicScene, view: View, priors: Priors, held_out: Int[Tensor, " n"]) -> Witness:
+def self_check(scene: DynamicScene, view: View, priors: Priors, held_out: Int[Tensor, " n"]) -> SelfCheck:
     """What a scene, with its overlay, says of frames that it was not fitted to; of others where `held_out` is empty.
 
     It is on the host.
     """
     total = len(view.rgb)
-    frames = held_out if len(held_out) else torch.linspace(0, total - 1, min(WITNESSES + 2, total)).round().long()
-    if len(held_out) == 0 and total > WITNESSES + 1:
+    frames = held_out if len(held_out) else evenly(total, CHECKED_FRAMES + 2)
+    if len(held_out) == 0 and total > CHECKED_FRAMES + 1:
         frames = frames[1:-1]
     camera = view.camera.select(frames)
     drawn = to_device(draw(scene, camera, frames), "cpu")
@@ -70,7 +72,7 @@ def witness(scene: DynamicScene, view: View, priors: Priors, held_out: Int[Tenso
     wrong, moving = (pictures - recorded).square().mean(-1), priors.instances[frames] > 0
     following = (frames + 1).clamp(max=total - 1)
     still = stands_still(priors.instances[frames] > 0) & stands_still(priors.instances[following] > 0)
-    return Witness(
+    return SelfCheck(
         frames,
         len(held_out) > 0,
         camera,
@@ -83,7 +85,7 @@ def witness(scene: DynamicScene, view: View, priors: Priors, held_out: Int[Tenso
         similarity(pictures, recorded),
         _track_residual(scene, view.camera, priors),
         flicker(recorded, view.rgb[following].float() / 255, still),
-        max(priors.depth_error, unsteadiness(priors) if view.camera.is_static else 0.0),
+        max(priors.depth_traits.relative_error, unsteadiness(priors) if view.camera.is_static else 0.0),
     )
 
 
@@ -92,7 +94,7 @@ def unsteadiness(priors: Priors) -> float:
 
     It has one depth, so that this is what its provider errs by at least; errors that stay do not show.
     """
-    frames = torch.linspace(0, len(priors.depth) - 1, min(DEPTH_FRAMES, len(priors.depth))).round().long()
+    frames = evenly(len(priors.depth), DEPTH_FRAMES)
     depth = priors.depth[frames]
     known = (depth > 0) & (priors.instances[frames] == 0)
     count = known.sum(0)
@@ -135,10 +137,10 @@ def _track_residual(scene: DynamicScene, camera: CameraTrack, priors: Priors) ->
     tracks = priors.tracks
     if len(tracks) == 0 or len(scene.moving) == 0:
         return 0.0
-    some = torch.linspace(0, len(tracks) - 1, min(TRACKED, len(tracks))).round().long().unique()
+    some = evenly(len(tracks), TRACKED)
     visible, xy = tracks.visible[some], tracks.xy[some]
     first = visible.long().argmax(1)
-    times = torch.linspace(0, scene.frames - 1, min(scene.frames, 12)).round().long()
+    times = evenly(scene.frames, TRACK_FRAMES)
     drawn = {int(time): _projected(scene, camera, int(time)) for time in torch.cat((times, first.unique()))}
     found = []
     for point in range(len(some)):

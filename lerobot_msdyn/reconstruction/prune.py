@@ -7,8 +7,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.core.serialise import to_device
-from lerobot_msdyn.dataset.read import View
 from lerobot_msdyn.scene.draw import draw, landed
 from lerobot_msdyn.scene.gaussians import DynamicScene
 
@@ -34,7 +35,7 @@ def without_disproved(scene: DynamicScene, view: View) -> DynamicScene:
     count = len(scene.moving)
     if count == 0:
         return scene
-    frames = torch.linspace(0, len(view.rgb) - 1, min(SAMPLES, len(view.rgb))).round().long()
+    frames = evenly(len(view), SAMPLES)
     seen, wrong = (torch.zeros(count, device=scene.device) for _ in range(2))
     for frame in frames.split(1):
         camera = to_device(view.camera.select(frame), scene.device)

@@ -8,8 +8,8 @@ from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.core.geometry import project, transform_points
+from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.core.serialise import to_device
-from lerobot_msdyn.dataset.read import View
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.scene.draw import draw, landed
 from lerobot_msdyn.scene.gaussians import DynamicScene, Gaussians

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.geometry import project, transform_points
+from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.core.serialise import to_device
-from lerobot_msdyn.dataset.read import View
 from lerobot_msdyn.priors import Priors
-from lerobot_msdyn.reconstruct.background import fill_depth, pixel_gaussians
+from lerobot_msdyn.reconstruction.background import fill_depth, pixel_gaussians
 from lerobot_msdyn.scene.draw import Rendering, draw, draw_patched
 from lerobot_msdyn.scene.gaussians import DynamicScene
 from lerobot_msdyn.scene.overlay import FramePatch, Overlay, packed
@@ -64,9 +64,8 @@ def unexplained(scene: DynamicScene, view: View, priors: Priors, backend: str = 
 
 def depth_tolerance(priors: Priors) -> float:
     """Relative difference of depths beyond which a picture is wrong; infinite for depth that is only assumed."""
-    if priors.provenance.get("depth", {}).get("provider") == "plane":
-        return math.inf
-    return max(DEPTH_ERROR, priors.depth_error)
+    traits = priors.depth_traits
+    return math.inf if traits.assumed else max(DEPTH_ERROR, traits.relative_error)
 
 
 def _wrong(

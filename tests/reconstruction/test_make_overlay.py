@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from lerobot_msdyn.core.cameras import CameraTrack, intrinsics_from_fov, static_camera
-from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.core.observations import DepthTraits, View
 from lerobot_msdyn.motion.model.bases import identity_level
 from lerobot_msdyn.priors import PointTracks, Priors
-from lerobot_msdyn.reconstruct.background import background_gaussians, pixel_gaussians
-from lerobot_msdyn.reconstruct.make_overlay import unexplained
+from lerobot_msdyn.reconstruction.background import background_gaussians, pixel_gaussians
+from lerobot_msdyn.reconstruction.make_overlay import unexplained
 from lerobot_msdyn.scene.draw import draw
 from lerobot_msdyn.scene.gaussians import DynamicScene, load_scene, save_scene
 from lerobot_msdyn.views.perturbation import orbit_offset
@@ -41,7 +41,7 @@ def recorded() -> tuple[DynamicScene, View, Priors]:
     moving = pixel_gaussians(rgb[0], depth[0], camera, 0)[0].select((instances[0] > 0).reshape(-1))
     rows = torch.zeros(len(moving), 1)
     scene = DynamicScene(static, moving, (identity_level(torch.zeros(1, 3), FRAMES),), (rows.long(),), (rows,), FRAMES)
-    return scene, View(rgb, camera), Priors(depth, instances, tracks, metric=True)
+    return scene, View(rgb, camera), Priors(depth, instances, tracks, DepthTraits(metric=True))
 
 
 def red(scene: DynamicScene, camera: CameraTrack, frame: int) -> torch.Tensor:

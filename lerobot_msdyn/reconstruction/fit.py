@@ -12,11 +12,12 @@ from torch import Tensor
 
 from lerobot_msdyn.core.config import FitConfig, LearningRates
 from lerobot_msdyn.core.errors import EpisodeError
+from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.core.serialise import to_device
-from lerobot_msdyn.dataset.read import View
 from lerobot_msdyn.priors import Priors
-from lerobot_msdyn.reconstruct.brightness import moving_gain, static_shading
-from lerobot_msdyn.reconstruct.losses import certain_pixels, depth_loss, mask_loss, rgb_loss
+from lerobot_msdyn.reconstruction.brightness import moving_gain, static_shading
+from lerobot_msdyn.reconstruction.losses import certain_pixels, depth_loss, mask_loss, rgb_loss
 from lerobot_msdyn.scene.draw import Rendering, draw
 from lerobot_msdyn.scene.gaussians import DynamicScene, Gaussians, with_slope
 from lerobot_msdyn.scene.shading import no_shading
@@ -160,7 +161,7 @@ def _frames(count: int, held_out: int, seed: int) -> tuple[Iterator[Int[Tensor, 
     generator = torch.Generator().manual_seed(seed)
     apart = torch.zeros(count, dtype=torch.bool)
     if held_out > 0 and count >= 10 * held_out:
-        apart[torch.linspace(0, count - 1, held_out + 2).round().long()[1:-1]] = True
+        apart[evenly(count, held_out + 2)[1:-1]] = True
     train = (~apart).nonzero()[:, 0]
 
     def endless() -> Iterator[Int[Tensor, "1"]]:
@@ -194,7 +195,7 @@ def _result(
 ) -> FitResult:
     last = history[-max(1, len(history) // 10) :]
     losses = {name: float(torch.stack([step[name] for step in last]).mean()) for name in (last[0] if last else {})}
-    frames = torch.linspace(0, len(view.rgb) - 1, min(SCORED_FRAMES, len(view.rgb))).round().long()
+    frames = evenly(len(view), SCORED_FRAMES)
     result = FitResult(scene, losses, psnr(scene, view, frames, backend), len(history), seconds, held_out)
     logger.info(
         "fit: %d + %d Gaussians, %d steps in %.0f s, %.1f dB on the recorded camera",

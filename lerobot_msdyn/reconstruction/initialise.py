@@ -11,11 +11,12 @@ from torch import Tensor
 
 from lerobot_msdyn.core.config import MotionConfig, SceneConfig
 from lerobot_msdyn.core.geometry import project, quaternion_multiply, transform_points
-from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.motion.estimate import SceneMotion, scene_motion
 from lerobot_msdyn.motion.to_video.register import Recording
 from lerobot_msdyn.priors import Priors
-from lerobot_msdyn.reconstruct.background import (
+from lerobot_msdyn.reconstruction.background import (
     EmptyScene,
     background_gaussians,
     empty_scene,
@@ -71,8 +72,7 @@ def gather_moving(
     Moving pixels of evenly spread frames are carried back by the motion of their part and merged in voxels of about a
     pixel's size, so that what one frame hides is taken from another. Larger voxels are used where these are too many.
     """
-    count = min(config.moving_frames, len(view.rgb))
-    frames = torch.linspace(0, len(view.rgb) - 1, count).round().long().unique().tolist()
+    frames = evenly(len(view), config.moving_frames).tolist()
     gathered, parts = [], []
     for frame in frames:
         inside = _certain(priors.instances[frame] > 0, priors.depth[frame], config.mask_border_px).reshape(-1)

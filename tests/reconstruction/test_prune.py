@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from lerobot_msdyn.core.cameras import intrinsics_from_fov, static_camera
-from lerobot_msdyn.dataset.read import View
+from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.motion.model.bases import identity_level
-from lerobot_msdyn.reconstruct.background import background_gaussians, pixel_gaussians
-from lerobot_msdyn.reconstruct.prune import without_disproved
+from lerobot_msdyn.reconstruction.background import background_gaussians, pixel_gaussians
+from lerobot_msdyn.reconstruction.prune import without_disproved
 from lerobot_msdyn.scene.gaussians import DynamicScene, rgb_to_sh
 from lerobot_msdyn.scene.shading import no_shading
 

@@ -7,8 +7,8 @@ import torch
 
 from lerobot_msdyn.core.cameras import CameraTrack, intrinsics_from_fov, static_camera
 from lerobot_msdyn.motion.model.bases import identity_level
-from lerobot_msdyn.reconstruct.antialias import enlarged
-from lerobot_msdyn.reconstruct.background import background_gaussians
+from lerobot_msdyn.reconstruction.antialias import enlarged
+from lerobot_msdyn.reconstruction.background import background_gaussians
 from lerobot_msdyn.scene.draw import draw
 from lerobot_msdyn.scene.gaussians import DynamicScene, isotropic
 from lerobot_msdyn.scene.overlay import FramePatch, packed

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.geometry import matrix_to_quaternion, transform_points, unproject_image
+from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.scene.gaussians import Gaussians, gaussians_from_points
 
 SIGMA_PX = 0.5  # standard deviation of a Gaussian, as a share of the spacing of its grid
@@ -51,7 +52,7 @@ def empty_scene(
         window = np.ones((2 * margin + 1,) * 2, np.uint8)
         still = np.stack([cv2.dilate((mask > 0).astype(np.uint8), window) == 0 for mask in instances.numpy()])
         still = still.reshape(frames, -1)
-        sample = np.linspace(0, frames - 1, min(frames, SAMPLES)).round().astype(int)
+        sample = evenly(frames, SAMPLES).numpy()
         some = np.flatnonzero(seen == 0)
         median[some], seen[some] = _median_of(colours, depths, still, some, sample)
         rare = some[seen[some] < min(FEW, len(sample))]
@@ -173,3 +174,16 @@ def background_gaussians(
     """
     step = max(1, math.ceil(math.sqrt(depth.numel() / most)))
     return pixel_gaussians(median, fill_depth(depth), camera, 0, step)[0]
+
+
+def look_at_distance(depth: Float[Tensor, "h w"]) -> float:
+    """Distance (m) to what the camera looks at: the median known depth of the middle of the image."""
+    h, w = depth.shape
+    middle = depth[h // 4 : h - h // 4, w // 4 : w - w // 4]
+    known = middle[middle > 0]
+    if known.numel() == 0:
+        known = depth[depth > 0]
+    return float(known.median()) if known.numel() else 1.0
+
+
+NEAR = 0.01  # of the look-at distance, within which nothing is drawn: depth may be of any scale

@@ -1,0 +1,98 @@
+"""What several episodes of a dataset show together of each camera's background, before any of them is worked on."""
+
+import contextlib
+import logging
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from lerobot.datasets import LeRobotDatasetMetadata
+from numpy import ndarray
+from torch import Tensor
+
+from lerobot_msdyn.core.config import Recipe
+from lerobot_msdyn.core.errors import EpisodeError, PriorError
+from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.dataset.read import read_episode
+from lerobot_msdyn.reconstruction.pooled_background import MAX_EPISODES, SharedBackground, few, few_frames
+from lerobot_msdyn.reconstruction.share_background import moving_in_few, share
+from lerobot_msdyn.render.cpu.threads import torch_on_one_thread
+
+logger = logging.getLogger(__name__)
+
+Backgrounds = Mapping[str, Sequence[SharedBackground]]  # by camera
+
+
+@dataclass(frozen=True)
+class MaskTask:
+    """What moves in some frames of one camera's video: what is asked of `moving_in_episode`."""
+
+    episode: int
+    key: str
+    recipe: Recipe
+    frames: UInt8[ndarray, "m h w 3"]  # of all episodes that are looked at
+
+
+Run = Callable[[Callable[[LeRobotDatasetMetadata, MaskTask], Any], list[MaskTask]], Iterable[Any]]
+
+
+def shared_backgrounds(
+    source: LeRobotDatasetMetadata, cameras: list[str], recipe: Recipe, run: Run | None = None
+) -> Backgrounds:
+    """Per camera, what some of its episodes show together, fitted once; one for every place in which it stood.
+
+    Episodes that cannot be read are left out here, and reported when it is their turn. `run` calls a function with the
+    source and each of some tasks, in this process or in others; by default in this one.
+    """
+    episodes = background_episodes(source, recipe)
+    if not episodes:
+        return {}
+    views: dict[str, dict[int, View]] = {key: {} for key in cameras}  # by episode
+    for index in episodes:
+        with contextlib.suppress(EpisodeError):
+            episode = read_episode(source, index, cameras, recipe.camera, recorded_depth=recipe.priors.depth != "plane")
+            for key, view in episode.views.items():
+                views[key][index] = few_frames(view).shrunk(recipe.fit.max_width)
+    found: dict[str, list[SharedBackground]] = {}
+    for key, some in views.items():
+        indices = list(some)
+
+        def moving(
+            numbers: Sequence[int], frames: Tensor, key: str = key, indices: list[int] = indices
+        ) -> Iterable[Tensor]:
+            tasks = [MaskTask(indices[number], key, recipe, frames.numpy()) for number in numbers]
+            found = (
+                (moving_in_episode(source, task) for task in tasks) if run is None else run(moving_in_episode, tasks)
+            )
+            return map(torch.from_numpy, found)
+
+        with torch_on_one_thread():
+            found[key] = share(list(some.values()), moving, recipe)
+    return found
+
+
+def moving_in_episode(source: LeRobotDatasetMetadata, task: MaskTask) -> UInt8[ndarray, "t h w"]:
+    """What moves in those frames of an episode that `few_frames` takes; everything, where no masks can be had."""
+    view = read_episode(source, task.episode, [task.key], task.recipe.camera, recorded_depth=False).views[task.key]
+    try:
+        with torch_on_one_thread():
+            return moving_in_few(view, task.recipe, torch.from_numpy(task.frames), task.episode, task.key).numpy()
+    except PriorError as error:  # a file of masks may be there for some episodes alone
+        logger.warning("shared background: episode %d is left out: %s", task.episode, error)
+        return np.ones((len(few(len(view.rgb))), *task.frames.shape[1:3]), np.uint8)
+
+
+def background_episodes(source: LeRobotDatasetMetadata, recipe: Recipe) -> list[int]:
+    """The episodes that `shared_backgrounds` looks at."""
+    if not recipe.scene.shared_background or source.total_episodes < 2:
+        return []
+    return looked_at(source.total_episodes)
+
+
+def looked_at(episodes: int) -> list[int]:
+    """Indices of those of a dataset's two or more episodes that are looked at."""
+    count = min(MAX_EPISODES, episodes)
+    return sorted({round(i * (episodes - 1) / (count - 1)) for i in range(count)})

@@ -1,0 +1,30 @@
+"""What the command line of `augment` sets; no torch here, so that `--help` answers at once."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from lerobot_msdyn.core.config import Recipe
+
+
+@dataclass
+class AugmentConfig(Recipe):
+    """`python -m lerobot_msdyn.augment`: a recipe and where to read and write."""
+
+    # Source dataset (alias: --repo).
+    repo_id: str = ""
+    # Exact folder of the source dataset; default: LeRobot's home, then the hub.
+    root: Path | None = None
+    # Name of the new dataset; default: the source's with _msdyn behind it.
+    new_repo_id: str | None = None
+    # Exact folder of the new dataset; default: LeRobot's home, or beside --root.
+    new_root: Path | None = None
+    # Source episodes to use, e.g. '[0,3]'; default: all.
+    episodes: list[int] | None = None
+    # Processes that work on episodes at once; 0: one per core, as far as memory allows. The result is the same.
+    workers: int = 0
+    # Report what would be done (episodes, disk, time) and stop.
+    dry_run: bool = False
+    # Throw away what an unfinished run for the same output has finished, instead of going on with it.
+    restart: bool = False
+    # Work on a converted copy of a source of version v2.1; the source stays as it is.
+    convert: bool = False

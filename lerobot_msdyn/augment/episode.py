@@ -1,0 +1,188 @@
+"""One source episode becomes its new ones: reconstructed, seen from new cameras, judged, encoded, staged."""
+
+import functools
+import logging
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from lerobot.datasets import LeRobotDatasetMetadata
+from torch import Tensor
+
+from lerobot_msdyn.augment.backgrounds import Backgrounds
+from lerobot_msdyn.core.cameras import read_calibration
+from lerobot_msdyn.core.config import OtherCameraConfig, Recipe
+from lerobot_msdyn.core.errors import ConfigError
+from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.dataset.provenance import SOURCE_VARIANT, Provenance, camera_pose
+from lerobot_msdyn.dataset.read import depth_key_of, read_episode
+from lerobot_msdyn.dataset.staging import SCENE
+from lerobot_msdyn.dataset.write import NewEpisode, OutputDataset
+from lerobot_msdyn.reconstruction.reconstruct import reconstruct
+from lerobot_msdyn.reconstruction.result import Reconstruction
+from lerobot_msdyn.render.devices import chosen_device
+from lerobot_msdyn.scene import store
+from lerobot_msdyn.scene.store import SceneSource
+from lerobot_msdyn.views.gate import judge, reasons, record
+from lerobot_msdyn.views.new_cameras import NewCameras, new_cameras
+from lerobot_msdyn.views.pictures import Picture, UnseenMasks, new_pictures, on_device
+
+logger = logging.getLogger(__name__)
+
+Progress = Callable[[str, float], object]  # (what is being done, share of the episode done since the last call)
+
+
+def augment_episode(
+    source: LeRobotDatasetMetadata,
+    index: int,
+    cameras: list[str],
+    recipe: Recipe,
+    output: OutputDataset,
+    progress: Progress = lambda what, share: None,
+    backgrounds: Backgrounds | None = None,
+) -> list[NewEpisode]:
+    """All new episodes of one source episode, staged in the output; `backgrounds` come from `shared_backgrounds`.
+
+    What an earlier run has finished of it is taken from the output's work folder.
+
+    Raises:
+        EpisodeError: the episode cannot be read.
+        PriorError: a prior was demanded and cannot be had.
+    """
+    episode = read_episode(source, index, cameras, recipe.camera, recorded_depth=recipe.priors.depth != "plane")
+    kept = output.episode(index)
+    scenes = {}
+    for key, view in episode.views.items():
+        progress(f"episode {index}: fitting {key}", 0.0)
+        make_scene = functools.partial(
+            reconstruct,
+            view,
+            recipe,
+            lambda share: progress("", 0.5 * share / len(cameras)),
+            (backgrounds or {}).get(key, []),
+            others=[other for name, other in episode.views.items() if name != key],
+            episode=index,
+            key=key,
+        )
+        scenes[key] = kept.keep(f"{SCENE}_{key}", make_scene)
+    drawn = {key: on_device(scene, chosen_device(recipe.device)) for key, scene in scenes.items()}
+    priors = {key: scene.provenance for key, scene in scenes.items()}
+    other = _other_pose(recipe, index, episode.views[cameras[0]])
+    new = []
+    if recipe.include_source:
+        new.append(NewEpisode(index, Provenance(source.repo_id, index, SOURCE_VARIANT, recipe.seed, {}, priors)))
+    for variant in range(recipe.variants):
+        progress(f"episode {index}: rendering variant {variant}", 0.0)
+        make_episode = functools.partial(_rendered, source, index, variant, recipe, output, drawn, other)
+        new.append(kept.keep(f"variant_{variant:02d}", make_episode))
+        progress("", 0.5 / recipe.variants)
+    if recipe.save_scenes:
+        for key, scene in scenes.items():
+            store.save(scene.saved(SceneSource(source.repo_id, index, key, source.fps)), output.scenes)
+    return new
+
+
+def _rendered(
+    source: LeRobotDatasetMetadata,
+    index: int,
+    variant: int,
+    recipe: Recipe,
+    output: OutputDataset,
+    scenes: Mapping[str, Reconstruction],
+    other: Tensor | None,
+) -> NewEpisode:
+    """One new episode, rendered and encoded; nothing is rendered of one that was dropped."""
+    start = time.perf_counter()
+    found, gate = _accepted(scenes, recipe, index, variant, other)
+    seconds = {"judging": round(time.perf_counter() - start, 1)}
+    seconds |= {f"fitting {key}": round(scene.seconds["fit"], 1) for key, scene in scenes.items()}
+    dropped = gate["rejected"][-1] if len(gate["rejected"]) > recipe.gate.redraws else ""
+    new = _staged(source, index, variant, recipe, output, scenes, found, gate, dropped=dropped)
+    return replace(new, seconds=seconds)
+
+
+def _accepted(
+    scenes: Mapping[str, Reconstruction], recipe: Recipe, index: int, variant: int, other: Tensor | None
+) -> tuple[NewCameras, dict[str, Any]]:
+    """The cameras of one new episode, drawn again where they are rejected, and the gate's record."""
+    rejected: list[str] = []
+    for attempt in range(recipe.gate.redraws + 1):
+        found = new_cameras(scenes, recipe, index, variant, attempt, other)
+        views: dict[str, dict[str, Any]] = {key: {"distance_m": scene.distance} for key, scene in scenes.items()}
+        why = [found.rejected] if found.rejected else []
+        for key, scene in scenes.items():
+            if recipe.gate.enabled:
+                scores = judge(scene.windows, found.cameras[key])
+                views[key]["scores"] = record(scores)
+                why += [f"{key}: {reason}" for reason in reasons(scores, recipe.gate)]
+        if not why:
+            break
+        rejected.append("; ".join(why))
+        logger.warning("episode %d variant %d, draw %d: rejected: %s", index, variant, attempt, rejected[-1])
+    return found, {"views": views, "rejected": rejected}
+
+
+def _staged(
+    source: LeRobotDatasetMetadata,
+    index: int,
+    variant: int,
+    recipe: Recipe,
+    output: OutputDataset,
+    scenes: Mapping[str, Reconstruction],
+    found: NewCameras,
+    gate: dict[str, Any],
+    *,
+    dropped: str,
+) -> NewEpisode:
+    provenance = Provenance(
+        source.repo_id,
+        index,
+        variant,
+        recipe.seed,
+        found.drawn,
+        {key: scene.provenance for key, scene in scenes.items()},
+        {key: camera_pose(scene.camera, found.cameras[key]) for key, scene in scenes.items()},
+        gate,
+    )
+    if dropped:
+        return NewEpisode(index, provenance, dropped=dropped)
+    pictures = {key: new_pictures(scene, found.cameras[key], fill=recipe.fill) for key, scene in scenes.items()}
+    masks = UnseenMasks() if recipe.masks else None
+    if masks is not None:
+        pictures = {key: masks.kept(key, some) for key, some in pictures.items()}
+    frames = by_feature(source, pictures, depth=recipe.render_depth)
+    new = output.stage(index, variant, frames, provenance)
+    return new if masks is None else replace(new, masks=masks.arrays())
+
+
+def _other_pose(recipe: Recipe, index: int, view: View) -> Tensor | None:
+    """World from the camera that `other_camera` names."""
+    config = recipe.perturbation
+    if not isinstance(config, OtherCameraConfig):
+        return None
+    camera = None
+    if recipe.camera.calibration is not None:
+        height, width = view.rgb.shape[1:3]
+        camera = read_calibration(recipe.camera.calibration, config.camera, index, 1, width, height)
+    if camera is None:
+        raise ConfigError(
+            f"perturbation.camera is {config.camera!r}, which the calibration {recipe.camera.calibration} does not "
+            "name; expected a camera with K, R and t there (--camera.calibration FILE)"
+        )
+    return camera.world_from_camera[0]
+
+
+def by_feature(
+    source: LeRobotDatasetMetadata, pictures: dict[str, Iterator[Picture]], *, depth: bool = True
+) -> Iterator[dict[str, np.ndarray]]:
+    """Per time, feature -> picture: the cameras in step, and the depth (if wanted) of those that have it recorded."""
+    for together in zip(*pictures.values(), strict=True):
+        features: dict[str, np.ndarray] = {}
+        for key, picture in zip(pictures, together, strict=True):
+            features[key] = picture.rgb
+            depth_key = depth_key_of(source, key) if depth else None
+            if depth_key is not None:
+                features[depth_key] = picture.depth
+        yield features

@@ -1,0 +1,268 @@
+"""View + Priors -> Reconstruction, as a list of named steps; nothing is written.
+
+The job, the evaluations, the viewer, the cost estimate and the benchmarks run this one list. A caller that needs
+another step in some place, as an ablation does, passes `with_steps(fit=its_own)`.
+"""
+
+import functools
+import logging
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from lerobot_msdyn.core.cameras import concatenated
+from lerobot_msdyn.core.config import Recipe, SceneConfig
+from lerobot_msdyn.core.observations import Priors, View
+from lerobot_msdyn.core.serialise import to_device
+from lerobot_msdyn.dataset.provenance import merged
+from lerobot_msdyn.priors import estimate_priors
+from lerobot_msdyn.reconstruction.antialias import enlarged
+from lerobot_msdyn.reconstruction.background import NEAR, EmptyScene, empty_scene, look_at_distance
+from lerobot_msdyn.reconstruction.evidence import Evidence, evidence_of
+from lerobot_msdyn.reconstruction.fit import FitResult, fit
+from lerobot_msdyn.reconstruction.initialise import initialise
+from lerobot_msdyn.reconstruction.make_overlay import unexplained
+from lerobot_msdyn.reconstruction.pooled_background import SharedBackground, adapted, completed, few_frames
+from lerobot_msdyn.reconstruction.prune import without_disproved
+from lerobot_msdyn.reconstruction.result import FittedWindow, Reconstruction
+from lerobot_msdyn.reconstruction.self_check import SelfCheck, self_check
+from lerobot_msdyn.reconstruction.share_background import moving_in_few, share
+from lerobot_msdyn.reconstruction.windows import windows
+from lerobot_msdyn.render.cpu.threads import torch_on_one_thread
+from lerobot_msdyn.render.devices import chosen_device
+from lerobot_msdyn.scene.gaussians import DynamicScene
+
+logger = logging.getLogger(__name__)
+
+ROUGH_BORDER_PX = 2  # with depth that is not sharp: from the border of a mask ...
+ROUGH_FRAMES = 6  # ... and so few frames are gathered, whose depths disagree
+FURTHER_STEPS = 0.6  # share of the fit's steps that suffices where the static set has been fitted already
+
+
+@dataclass
+class Draft:
+    """One window of a video on its way to a fitted scene; every step reads what earlier ones set, and sets its own."""
+
+    view: View  # at the size at which it is fitted; from the step `priors` on with the camera that is used
+    recipe: Recipe
+    recorded_width: int  # px, of the video's own pictures
+    estimate: Callable[..., Priors]  # (view, elsewhere=) -> the window's priors
+    backgrounds: Sequence[SharedBackground]
+    progress: Callable[[float], object]
+    device: torch.device
+    shared: SharedBackground | None = None  # the one that fits this window
+    priors: Priors = field(init=False)
+    empty: EmptyScene = field(init=False)
+    distance: float = field(init=False)  # m, to the look-at point
+    scene: DynamicScene = field(init=False)
+    fitted: FitResult = field(init=False)
+    evidence: Evidence = field(init=False)
+    self_check: SelfCheck = field(init=False)
+    seconds: dict[str, float] = field(default_factory=dict)  # by step
+
+    def window(self, start: int) -> FittedWindow:
+        """What all steps have made, on the host."""
+        scene, evidence = to_device((self.scene, self.evidence), "cpu")
+        fitted = self.fitted
+        return FittedWindow(start, scene, evidence, self.self_check, fitted.steps, fitted.train_psnr_db, self.seconds)
+
+
+Step = Callable[[Draft], None]
+
+
+def _priors(draft: Draft) -> None:
+    """What the video says before any fit; and the camera."""
+    shared = next((background for background in draft.backgrounds if background.fits(draft.view)), None)
+    draft.priors = draft.estimate(draft.view, elsewhere=None if shared is None else shared.frames)
+    draft.view = replace(draft.view, camera=draft.priors.camera or draft.view.camera)
+    if shared is not None and shared.fits(draft.view):  # it may be another camera than was assumed at first
+        draft.shared = shared
+    if not draft.view.camera.is_static:
+        logger.warning("the camera moves, but the empty scene is built as if it were fixed: expect blur")
+
+
+def _background(draft: Draft) -> None:
+    """What the camera sees where nothing moves."""
+    empty = empty_scene(draft.view.rgb, draft.priors.depth, draft.priors.instances)
+    draft.empty = empty if draft.shared is None else completed(empty, draft.shared.empty, len(draft.view))
+    draft.distance = look_at_distance(draft.empty.depth)
+
+
+def _initial_scene(draft: Draft) -> None:
+    """Static and moving Gaussians, and the motion of the latter."""
+    settings = draft.recipe.scene
+    if not draft.priors.depth_traits.sharp:
+        settings = _for_rough_depth(settings)
+    scene = initialise(draft.view, draft.priors, settings, draft.recipe.motion, draft.empty)
+    if draft.shared is not None and draft.shared.static is not None:
+        scene = replace(scene, static=adapted(draft.shared, draft.empty, scene.static))
+    draft.scene = replace(scene, near=NEAR * draft.distance)
+
+
+def _fit(draft: Draft) -> None:
+    """Gaussians that show the recorded pictures."""
+    config = draft.recipe.fit
+    if draft.shared is not None and draft.shared.static is not None:
+        config = replace(config, steps=round(FURTHER_STEPS * config.steps))
+    draft.fitted = fit(
+        to_device(draft.scene, draft.device),
+        draft.view,
+        draft.priors,
+        config,
+        empty=draft.empty.rgb,
+        distance=draft.distance,
+        seed=draft.recipe.seed,
+        progress=lambda done: draft.progress(done / config.steps),
+    )
+    draft.scene = draft.fitted.scene
+
+
+def _prune(draft: Draft) -> None:
+    """Without moving Gaussians that the video contradicts; where depth is measured, depth has done that."""
+    if not draft.priors.depth_traits.measured:
+        draft.scene = without_disproved(draft.scene, draft.view)
+
+
+def _evidence(draft: Draft) -> None:
+    """What the recorded camera has shown of the scene."""
+    draft.evidence = evidence_of(draft.scene, draft.view.camera, draft.empty)
+
+
+def _overlay(draft: Draft) -> None:
+    """Recorded pixels of single frames that the scene does not explain."""
+    if draft.recipe.scene.overlay:
+        draft.scene = replace(draft.scene, overlay=unexplained(draft.scene, draft.view, draft.priors))
+
+
+def _self_check(draft: Draft) -> None:
+    """How well the scene explains its own video."""
+    draft.self_check = self_check(draft.scene, draft.view, draft.priors, draft.fitted.held_out)
+
+
+def _antialias(draft: Draft) -> None:
+    """Gaussians that close their gaps at the size of the recorded pictures."""
+    ratio = draft.recorded_width / draft.view.camera.width
+    draft.scene = enlarged(draft.scene, draft.view.camera, ratio)
+
+
+STEPS: dict[str, Step] = {
+    "priors": _priors,
+    "background": _background,
+    "initial scene": _initial_scene,
+    "fit": _fit,
+    "prune": _prune,
+    "evidence": _evidence,
+    "overlay": _overlay,
+    "self-check": _self_check,
+    "antialias": _antialias,
+}
+
+
+def with_steps(others: dict[str, Step]) -> dict[str, Step]:
+    """The steps with some of them, by name, exchanged for others.
+
+    Raises:
+        KeyError: there is no step of that name.
+    """
+    unknown = set(others) - set(STEPS)
+    if unknown:
+        raise KeyError(f"no step {', '.join(sorted(unknown))}; expected some of {', '.join(STEPS)}")
+    return STEPS | others
+
+
+def reconstruct(
+    view: View,
+    recipe: Recipe,
+    progress: Callable[[float], object] = lambda share: None,
+    backgrounds: Sequence[SharedBackground] = (),
+    *,
+    others: Sequence[View] = (),
+    episode: int | None = None,
+    key: str | None = None,
+    steps: dict[str, Step] = STEPS,
+) -> Reconstruction:
+    """Priors, initial scene and fit of one camera's video; the first of the shared backgrounds that fits is used.
+
+    Long videos are cut into windows, each with priors and a scene of its own, so that memory beyond the video itself
+    is that of one window. Windows share a background as episodes do. The fit runs on the recipe's device; the result
+    is on the host.
+
+    Args:
+        view: the video, at its own size.
+        recipe: all settings.
+        progress: called with the share of the work, 0..1, that was done since the last call.
+        backgrounds: what several episodes of this camera show together.
+        others: videos of the same moments by other cameras, for stereo.
+        episode: index of the episode, by which exchange files are found and checked.
+        key: feature key of the camera, likewise.
+        steps: what is done with each window, in this order.
+
+    Raises:
+        ConfigError: the recipe demands a device that cannot be used.
+        EpisodeError: the fit diverges.
+        PriorError: a prior was demanded and cannot be had.
+    """
+    parts = windows(view, recipe)
+    if len(parts) > 1 and not backgrounds and recipe.scene.shared_background:
+        backgrounds = _shared_by_windows([part for _, part in parts], recipe, episode, key)
+    beside = [[window.shrunk(recipe.fit.max_width) for _, window in windows(other, recipe)] for other in others]
+    device = chosen_device(recipe.device)
+    fitted: list[FittedWindow] = []
+    metric, provenance, distances = [], [], []
+    for number, (start, window) in enumerate(parts):
+        estimate = functools.partial(
+            estimate_priors,
+            config=recipe.priors,
+            camera=recipe.camera,
+            others=[other[number] for other in beside],
+            episode=episode,
+            key=key,
+            device=recipe.device,
+        )
+
+        def within(share: float) -> object:
+            return progress(share / len(parts))
+
+        small = window.shrunk(recipe.fit.max_width)
+        draft = Draft(small, recipe, window.camera.width, estimate, backgrounds, within, device)
+        with torch_on_one_thread():
+            for name, step in steps.items():
+                begin = time.perf_counter()
+                step(draft)
+                draft.seconds[name] = time.perf_counter() - begin
+        fitted.append(draft.window(start))
+        metric.append(draft.priors.metric)
+        provenance.append(draft.priors.provenance)
+        distances.append(draft.distance)
+    camera = concatenated([window.evidence.camera for window in fitted])
+    return Reconstruction(
+        windows=tuple(fitted),
+        metric=all(metric),
+        provenance=merged(provenance),
+        camera=camera.resized(view.camera.width, view.camera.height),
+        distance=distances[0],
+    )
+
+
+def _shared_by_windows(
+    parts: Sequence[View], recipe: Recipe, episode: int | None, key: str | None
+) -> list[SharedBackground]:
+    """What the windows of one video show together."""
+
+    def moving(numbers: Sequence[int], frames: Tensor) -> list[Tensor]:
+        return [moving_in_few(parts[number], recipe, frames, episode, key) for number in numbers]
+
+    with torch_on_one_thread():
+        return share([few_frames(part).shrunk(recipe.fit.max_width) for part in parts], moving, recipe)
+
+
+def _for_rough_depth(scene: SceneConfig) -> SceneConfig:
+    """Settings for depth that is uncertain near edges, and disagrees between frames."""
+    return replace(
+        scene,
+        mask_border_px=max(scene.mask_border_px, ROUGH_BORDER_PX),
+        moving_frames=min(scene.moving_frames, ROUGH_FRAMES),
+    )

@@ -1,0 +1,102 @@
+"""What several videos of one camera show together is fitted once, and kept on disk."""
+
+import dataclasses
+import logging
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lerobot_msdyn.core.config import Recipe
+from lerobot_msdyn.core.errors import EpisodeError
+from lerobot_msdyn.core.observations import DepthTraits, PointTracks, Priors, View
+from lerobot_msdyn.core.serialise import to_device
+from lerobot_msdyn.priors import estimate_masks
+from lerobot_msdyn.priors.cache import code_digest, digest_of, open_cache
+from lerobot_msdyn.reconstruction.background import NEAR, look_at_distance
+from lerobot_msdyn.reconstruction.fit import fit
+from lerobot_msdyn.reconstruction.initialise import initialise
+from lerobot_msdyn.reconstruction.pooled_background import (
+    MovingIn,
+    SharedBackground,
+    as_arrays,
+    few,
+    from_arrays,
+    pooled,
+    same_places,
+)
+from lerobot_msdyn.reconstruction.windows import windows
+from lerobot_msdyn.render.devices import chosen_device
+
+logger = logging.getLogger(__name__)
+
+
+def share(views: list[View], moving: MovingIn, recipe: Recipe) -> list[SharedBackground]:
+    """A fitted background per place in which a camera stood, from some frames of several videos; kept on disk."""
+    return [_kept([views[i] for i in group], group, moving, recipe) for group in same_places(views)]
+
+
+def _kept(views: list[View], numbers: list[int], moving: MovingIn, recipe: Recipe) -> SharedBackground:
+    """That of videos from one place: an earlier run's of the same frames and settings, else a new one."""
+    frames, camera = torch.cat([view.rgb for view in views]), views[0].camera.select([0])
+    settings: dict[str, Any] = {name: dataclasses.asdict(getattr(recipe, name)) for name in ("camera", "scene", "fit")}
+    settings |= {
+        "priors": dataclasses.asdict(replace(recipe.priors, cache="")),
+        "seed": recipe.seed,
+        "depth": [
+            None if view.depth is None else digest_of(view.depth.contiguous().view(torch.uint8)) for view in views
+        ],
+        "camera in use": [camera.intrinsics.tolist(), camera.world_from_camera.tolist()],
+        "package": code_digest(Path(__file__).parents[1]),
+    }
+
+    def compute() -> dict:
+        return as_arrays(_fitted(pooled(views, numbers, moving), recipe))
+
+    cache = open_cache(recipe.priors.cache, frames)
+    return from_arrays(cache.get("background", "shared", settings, compute), camera, frames)
+
+
+def moving_in_few(view: View, recipe: Recipe, elsewhere: Tensor, episode: int | None, key: str | None) -> Tensor:
+    """What moves in the frames that `few_frames` takes; the masks of the whole video, which its fit finds cached."""
+    masks = [
+        estimate_masks(
+            window.shrunk(recipe.fit.max_width),
+            recipe.priors,
+            recipe.camera,
+            elsewhere=elsewhere,
+            episode=episode,
+            key=key,
+            device=recipe.device,
+        )
+        for _, window in windows(view, recipe)
+    ]
+    return torch.cat(masks)[few(len(view.rgb))]
+
+
+def _fitted(background: SharedBackground, recipe: Recipe) -> SharedBackground:
+    """A shared background with a static set that was fitted to its picture; without depth there is none."""
+    empty, camera = background.empty, background.camera
+    if not bool((empty.depth > 0).any()):
+        return background
+    nothing = torch.zeros(1, *empty.seen.shape, dtype=torch.uint8)
+    priors = Priors(empty.depth[None], nothing, _no_tracks(), DepthTraits(metric=True))
+    view = View(empty.rgb[None], camera)
+    scene = initialise(view, priors, replace(recipe.scene, moving_gaussians=0), recipe.motion, empty)
+    config = replace(recipe.fit, steps=recipe.fit.steps // 2, shadows=False, held_out_frames=0)
+    try:
+        distance = look_at_distance(empty.depth)
+        scene = replace(scene, near=NEAR * distance)
+        scene = to_device(scene, chosen_device(recipe.device))
+        result = fit(scene, view, priors, config, empty=empty.rgb, distance=distance, seed=recipe.seed)
+    except EpisodeError as error:
+        logger.warning("shared background: %s; every episode fits its own", error)
+        return background
+    return replace(background, static=to_device(result.scene.static, "cpu"))
+
+
+def _no_tracks() -> PointTracks:
+    none = torch.zeros(0, 1)
+    return PointTracks(torch.zeros(0, 1, 2), none.bool(), none, torch.zeros(0, dtype=torch.long))
