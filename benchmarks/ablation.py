@@ -116,7 +116,7 @@ def recipe_of(row: Row, settings: Settings, seed: int) -> Recipe:
     recipe.priors.cache = "off"
     recipe.scene = replace(recipe.scene, **({"overlay": False} | row.scene))
     recipe.motion = replace(recipe.motion, **row.motion)
-    weights = replace(recipe.fit.weights, **row.weights)
+    weights = recipe.fit.weights | row.weights
     recipe.fit = replace(recipe.fit, steps=settings.steps, max_width=settings.width, weights=weights)
     return recipe
 

@@ -10,7 +10,8 @@ from typing import Literal
 
 import draccus
 
-from lerobot_msdyn.core.fields import INFINITY, between, one_of
+from lerobot_msdyn.core.fields import INFINITY, between, numbers_of, one_of
+from lerobot_msdyn.core.registries import LOSSES
 
 # Named: draccus finds the comment above a field only where its annotation holds no quotes.
 Device = Literal["auto", "cpu", "cuda"]
@@ -130,18 +131,6 @@ class MotionConfig:
 
 
 @dataclass
-class LossWeights:
-    """Weight of each loss term."""
-
-    # Absolute colour difference.
-    rgb: float = between(1.0, 0, INFINITY)
-    # Absolute difference of inverse depth, relative to the mean inverse depth.
-    depth: float = between(0.1, 0, INFINITY)
-    # Absolute difference between the drawn share of moving Gaussians and the mask of what moves.
-    mask: float = between(0.1, 0, INFINITY)
-
-
-@dataclass
 class LearningRates:
     """Adam step sizes."""
 
@@ -177,7 +166,10 @@ class FitConfig:
     held_out_frames: int = between(3, 0, 1000)
     # Steps without improvement on the held-out frames after which the fit stops.
     patience: int = between(150, 1, 1_000_000)
-    weights: LossWeights = field(default_factory=LossWeights)
+    # Weight of each loss term; those that are not named, or have 0, are not used. rgb: absolute colour difference;
+    # depth: absolute difference of inverse depth, relative to its mean; mask: absolute difference between the rendered
+    # share of moving Gaussians and the mask of what moves; or a user's own (--fit.weights.NAME).
+    weights: dict[str, float] = numbers_of({"rgb": 1.0, "depth": 0.1, "mask": 0.1}, 0, INFINITY, registry=LOSSES)
     learning_rates: LearningRates = field(default_factory=LearningRates)
 
 

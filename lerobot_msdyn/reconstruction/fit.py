@@ -7,18 +7,19 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from lerobot_msdyn.core.config import FitConfig, LearningRates
 from lerobot_msdyn.core.errors import EpisodeError
 from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.core.registries import LOSSES
 from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.reconstruction.brightness import moving_gain, static_shading
-from lerobot_msdyn.reconstruction.losses import certain_pixels, depth_loss, mask_loss, rgb_loss
-from lerobot_msdyn.scene.draw import Rendering, draw
+from lerobot_msdyn.reconstruction.loss_terms import FitStep, Targets, certain_pixels
+from lerobot_msdyn.scene.draw import draw
 from lerobot_msdyn.scene.gaussians import DynamicScene, Gaussians, with_slope
 from lerobot_msdyn.scene.shading import no_shading
 
@@ -36,29 +37,11 @@ class FitResult:
     """A fitted scene and how the fit went."""
 
     scene: DynamicScene
-    losses: dict[str, float]  # mean of each unweighted term over the last tenth of the steps
+    losses: dict[str, float]  # mean of each unweighted term in use over the last tenth of the steps
     train_psnr_db: float  # over a few frames of the recorded camera
     steps: int  # how many were taken
     seconds: float
     held_out: Int[Tensor, " b"]  # frames that were not fitted
-
-
-@dataclass(frozen=True)
-class _Targets:
-    """What a video's frames should look like, on the device of the scene."""
-
-    view: View
-    depth: Float[Tensor, "t h w"]  # m, 0 = unknown
-    moves: Bool[Tensor, "t h w"]
-    certain: Bool[Tensor, "t h w"]  # where the mask can be trusted
-
-    def terms(self, drawn: Rendering, frames: Int[Tensor, " b"]) -> dict[str, Float[Tensor, ""]]:
-        """All loss terms, unweighted, by the names of their weights."""
-        return {
-            "rgb": rgb_loss(drawn.rgb, self.view.rgb[frames].float() / 255),
-            "depth": depth_loss(drawn.depth, self.depth[frames], drawn.alpha),
-            "mask": mask_loss(drawn.moving, self.moves[frames], self.certain[frames]),
-        }
 
 
 def fit(
@@ -82,7 +65,7 @@ def fit(
         scene: where to start from; it is not changed.
         view: the video, at the size at which it is fitted; on the host.
         priors: its priors, at the same size; on the host.
-        config: steps, weights and learning rates.
+        config: steps, weights of the loss terms in use, and learning rates.
         empty: what the camera sees where nothing moves, by which brightness is measured.
         distance: distance to the look-at point (m), the unit of the means' learning rate.
         seed: fixes the order of the frames.
@@ -91,6 +74,7 @@ def fit(
         learned: further groups of parameters for Adam, such as leaves among the scene's levels; changed in place.
 
     Raises:
+        ConfigError: a weight names a loss term that is not there.
         EpisodeError: the loss is no finite number any more.
     """
     start = time.perf_counter()
@@ -104,7 +88,9 @@ def fit(
         optimizer.add_param_group(group)
     decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, FINAL_RATE ** (1 / max(config.steps, 1)))
     moves = priors.instances > 0
-    targets = to_device(_Targets(view, priors.depth, moves, certain_pixels(moves, MASK_BAND_PX)), scene.device)
+    certain = certain_pixels(moves, MASK_BAND_PX)
+    targets = to_device(Targets(view, priors, moves, certain, distance), scene.device)
+    terms = {name: (LOSSES.get(name), weight) for name, weight in config.weights.items() if weight > 0}
     order, held_out = _frames(len(view.rgb), config.held_out_frames, seed)
     enough = _Enough(targets.view, held_out, config.patience, backend)
     history: list[dict[str, Tensor]] = []
@@ -112,14 +98,17 @@ def fit(
         if step == int(config.moving_gain_from * config.steps) and len(scene.moving) > 0:
             scene = _with_moving_gain(scene, view, priors, backend)
         frames = next(order).to(scene.device)
-        terms = targets.terms(draw(scene, targets.view.camera.select(frames), frames, backend), frames)
-        loss = torch.stack([getattr(config.weights, name) * term for name, term in terms.items()]).sum()
-        _check(loss, step, frames)
+        rendering = draw(scene, targets.view.camera.select(frames), frames, backend)
+        now = FitStep(scene, frames, rendering, targets)
+        values = {name: term(now) for name, (term, _) in terms.items()}
         optimizer.zero_grad(set_to_none=True)
-        loss.backward()
+        if values:
+            loss = torch.stack([terms[name][1] * value for name, value in values.items()]).sum()
+            _check(loss, step, frames)
+            loss.backward()
         optimizer.step()
         decay.step()
-        history.append({name: term.detach() for name, term in terms.items()})
+        history.append({name: value.detach() for name, value in values.items()})
         progress(1)
         if enough(scene, step + 1):
             break

@@ -118,7 +118,7 @@ def test_progress_is_reported_step_by_step() -> None:
 def test_a_weight_of_zero_switches_a_term_off() -> None:
     view, priors = still_video()
     config = FitConfig(steps=5)
-    config.weights.rgb, config.weights.depth, config.weights.mask = 0.0, 0.0, 0.0
+    config.weights = {"rgb": 0.0, "depth": 0.0, "mask": 0.0}
     scene = grey_scene(view)
     result = fit(scene, view, priors, config, empty=view.rgb[0], distance=1.0, seed=0)
     assert torch.equal(result.scene.static.sh, scene.static.sh)
@@ -159,6 +159,6 @@ def test_numbers_that_are_not_finite_end_the_fit() -> None:
     view, priors = still_video()
     scene = grey_scene(view)
     config = FitConfig(steps=3)
-    config.weights.rgb = float("inf")
+    config.weights["rgb"] = float("inf")
     with pytest.raises(EpisodeError, match="diverged at step 0, frame"):
         fit(scene, view, priors, config, empty=view.rgb[0], distance=1.0, seed=0)

@@ -1,0 +1,45 @@
+"""What a loss term is given. The terms are files of their own in `losses/`, or a user's (docs/extending.md)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lerobot_msdyn.core.observations import Priors, View
+from lerobot_msdyn.scene.draw import Rendering
+from lerobot_msdyn.scene.gaussians import DynamicScene
+
+
+@dataclass(frozen=True)
+class Targets:
+    """What a video's frames should look like; all of them, on the device of the scene."""
+
+    view: View  # at the size at which it is fitted
+    priors: Priors  # at the same size
+    moves: Bool[Tensor, "t h w"]
+    certain: Bool[Tensor, "t h w"]  # where the mask can be trusted
+    distance: float  # m, to the look-at point: the scene's unit of length
+
+
+@dataclass(frozen=True)
+class FitStep:
+    """One step of the fit: some frames as the scene shows them, the scene itself, and what was recorded."""
+
+    scene: DynamicScene  # as it is optimised; its tensors carry gradients
+    frames: Int[Tensor, " b"]  # that are compared
+    rendering: Rendering  # of these frames, through the recorded camera; carries gradients
+    targets: Targets
+
+
+LossTerm = Callable[[FitStep], Float[Tensor, ""]]  # unweighted; the weight is the recipe's
+
+
+def certain_pixels(moving: Bool[Tensor, "t h w"], band: int) -> Bool[Tensor, "t h w"]:
+    """Pixels further than `band` px from the border of a mask: there the mask can be trusted."""
+    window = np.ones((2 * band + 1,) * 2, np.uint8)
+    masks = moving.numpy().astype(np.uint8)
+    return torch.from_numpy(np.stack([(cv2.dilate(mask, window) == cv2.erode(mask, window)) for mask in masks]))
