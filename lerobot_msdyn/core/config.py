@@ -74,7 +74,7 @@ class SceneConfig:
     moving_gaussians: int = between(20_000, 0, 10_000_000)
     # Number of frames from which the moving set is gathered.
     moving_frames: int = between(20, 1, 100_000)
-    # Pixels along the border of a mask, and beside depth edges, from which no moving point is taken.
+    # Pixels (of pictures 320 wide) along masks' borders, and beside depth edges, from which no moving point is taken.
     mask_border_px: int = between(1, 0, 100)
     # Side of the voxels in which the gathered moving points are merged, in pixels of the fitted image.
     moving_voxel_px: float = between(0.8, 0.05, 100)

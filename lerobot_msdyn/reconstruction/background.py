@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.geometry import matrix_to_quaternion, transform_points, unproject_image
-from lerobot_msdyn.core.sampling import evenly
+from lerobot_msdyn.core.sampling import evenly, scaled_px
 from lerobot_msdyn.scene.gaussians import Gaussians, gaussians_from_points
 
 SIGMA_PX = 0.5  # standard deviation of a Gaussian, as a share of the spacing of its grid
@@ -21,8 +21,8 @@ MAX_STRETCH = 4.0  # surfaces seen at a grazing angle are stretched at most so m
 OPACITY = 0.95
 SAMPLES = 60  # frames over which medians are taken where they suffice ...
 FEW = 10  # ... which is where so many of them show the empty scene; elsewhere all frames are looked at
-MARGIN_PX = 2  # what moves bleeds so far beyond its mask: blur, the codec, and the mask's own error
-INPAINT_RADIUS_PX = 3
+MARGIN_PX = 2  # of 320: what moves bleeds so far beyond its mask: blur, the codec, and the mask's own error
+INPAINT_RADIUS_PX, LEAST_RADIUS_PX = 3, 2  # the first of 320
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,8 @@ def empty_scene(
     colours, depths = rgb.numpy().reshape(frames, -1, 3), depth.numpy().reshape(frames, -1)
     median = np.zeros((height * width, 4), np.float32)
     seen = np.zeros(height * width, np.int64)
-    for margin in range(MARGIN_PX, -1, -1):  # closer to what moves only where nothing better shows a pixel
+    widest = max(1, round(scaled_px(MARGIN_PX, width)))
+    for margin in range(widest, -1, -1):  # closer to what moves only where nothing better shows a pixel
         window = np.ones((2 * margin + 1,) * 2, np.uint8)
         still = np.stack([cv2.dilate((mask > 0).astype(np.uint8), window) == 0 for mask in instances.numpy()])
         still = still.reshape(frames, -1)
@@ -60,7 +61,8 @@ def empty_scene(
     unknown = (seen == 0).reshape(height, width)
     picture = median[:, :3].round().astype(np.uint8).reshape(height, width, 3)
     if unknown.any() and not unknown.all():
-        picture = cv2.inpaint(picture, unknown.astype(np.uint8), INPAINT_RADIUS_PX, cv2.INPAINT_TELEA)
+        radius_px = max(LEAST_RADIUS_PX, scaled_px(INPAINT_RADIUS_PX, width))
+        picture = cv2.inpaint(picture, unknown.astype(np.uint8), radius_px, cv2.INPAINT_TELEA)
     return EmptyScene(
         torch.from_numpy(picture),
         torch.from_numpy(median[:, 3].reshape(height, width)),

@@ -9,15 +9,16 @@ from torch import Tensor
 
 from lerobot_msdyn.core.geometry import project, transform_points
 from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.core.sampling import scaled_px, scaled_window
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.scene.draw import draw, landed
 from lerobot_msdyn.scene.gaussians import DynamicScene, Gaussians
 from lerobot_msdyn.scene.shading import Shading, encode_gain, no_shading
 
-BLUR_PX = 1.5  # noise, and texture that does not fit, are averaged over about this
+BLUR_PX = 1.5  # of 320: noise, and texture that does not fit, are averaged over about this
 FIELD_STEP = 2  # px of the fitted image per pixel of the field of gains
-MASK_MARGIN_PX = 2  # colours of what moves bleed this far
+MASK_MARGIN_PX = 2  # of 320: colours of what moves bleed this far
 FLOOR = 4.0  # grey levels added to both sides of a ratio: noise in the dark is no gain
 SURE_WEIGHT = 0.5  # share of the blur's window that must be known
 MOVING_STEP = 2  # the moving set is measured at every second frame, and over three of these
@@ -51,7 +52,7 @@ def static_shading(
 
 def _field_sums(view: View, priors: Priors, empty: Float32[ndarray, "h w"], frame: int) -> Float32[ndarray, "a b 3"]:
     """Blurred brightness of the frame and of the empty scene where nothing moves, and the share of such pixels."""
-    window = np.ones((2 * MASK_MARGIN_PX + 1,) * 2, np.uint8)
+    window = scaled_window(MASK_MARGIN_PX, view.camera.width)
     still = cv2.dilate((priors.instances[frame] > 0).numpy().astype(np.uint8), window) == 0
     height, width = still.shape
     sums = _blurred_sums(_grey(view.rgb[frame].numpy()), empty, still)
@@ -64,7 +65,7 @@ def _blurred_sums(
 ) -> Float32[ndarray, "h w 3"]:
     weight = usable.astype(np.float32)
     stacked = np.stack(((numerator + FLOOR) * weight, (denominator + FLOOR) * weight, weight), axis=-1)
-    return cv2.GaussianBlur(stacked, (0, 0), BLUR_PX)
+    return cv2.GaussianBlur(stacked, (0, 0), scaled_px(BLUR_PX, usable.shape[1]))
 
 
 def _ratio(sums: Float32[ndarray, "a b 3"]) -> Float32[ndarray, "a b"]:

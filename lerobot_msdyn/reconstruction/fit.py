@@ -14,7 +14,7 @@ from lerobot_msdyn.core.config import FitConfig, LearningRates
 from lerobot_msdyn.core.errors import EpisodeError
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.core.registries import LOSSES
-from lerobot_msdyn.core.sampling import evenly
+from lerobot_msdyn.core.sampling import evenly, scaled_window
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.reconstruction.brightness import moving_gain, static_shading
@@ -25,7 +25,7 @@ from lerobot_msdyn.scene.shading import no_shading
 
 logger = logging.getLogger(__name__)
 
-MASK_BAND_PX = 2  # the mask is not trusted closer than this to its border
+MASK_BAND_PX = 2  # of 320: the mask is not trusted closer than this to its border
 FINAL_RATE = 0.1  # the learning rates decay exponentially to this share
 CHECK_STEPS = 50  # from one look at the held-out frames to the next
 GAIN_DB = 0.02  # less than this is no improvement
@@ -88,7 +88,7 @@ def fit(
         optimizer.add_param_group(group)
     decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, FINAL_RATE ** (1 / max(config.steps, 1)))
     moves = priors.instances > 0
-    certain = certain_pixels(moves, MASK_BAND_PX)
+    certain = certain_pixels(moves, scaled_window(MASK_BAND_PX, view.camera.width))
     targets = to_device(Targets(view, priors, moves, certain, distance), scene.device)
     terms = {name: (LOSSES.get(name), weight) for name, weight in config.weights.items() if weight > 0}
     order, held_out = _frames(len(view.rgb), config.held_out_frames, seed)

@@ -12,7 +12,7 @@ from torch import Tensor
 from lerobot_msdyn.core.config import MotionConfig, SceneConfig
 from lerobot_msdyn.core.geometry import project, quaternion_multiply, transform_points
 from lerobot_msdyn.core.observations import View
-from lerobot_msdyn.core.sampling import evenly
+from lerobot_msdyn.core.sampling import evenly, scaled_window
 from lerobot_msdyn.motion.estimate import SceneMotion, scene_motion
 from lerobot_msdyn.motion.to_video.register import Recording
 from lerobot_msdyn.priors import Priors
@@ -25,7 +25,7 @@ from lerobot_msdyn.reconstruction.background import (
 )
 from lerobot_msdyn.scene.gaussians import DynamicScene, Gaussians, concatenate, isotropic
 
-MASK_BORDER_PX = 1  # pixels along the border of a mask mix two surfaces
+MASK_BORDER_PX = 2  # of 320: so far from a mask its border cannot be trusted
 FRONT_MARGIN = 0.01  # a point nearer than this share of the recorded depth is in front of it
 MAX_CONTRADICTIONS = 0.3  # share of frames in which a point may be missing where it should have been seen
 VOXEL_GROWTH = 1.15  # of the voxels' side, until there are few enough
@@ -160,9 +160,9 @@ def merge_voxels(gaussians: Gaussians, part: Int[Tensor, " n"], voxel: float) ->
     return merged, part[first]
 
 
-def _certain(mask: Bool[Tensor, "h w"], depth: Float[Tensor, "h w"], border: int) -> Bool[Tensor, "h w"]:
-    """Pixels `border` px inside a mask, of known depth, and as far from depth edges."""
-    window = np.ones((2 * border + 1,) * 2, np.uint8)
+def _certain(mask: Bool[Tensor, "h w"], depth: Float[Tensor, "h w"], border_px: int) -> Bool[Tensor, "h w"]:
+    """Pixels `border_px` (of a picture 320 wide) inside a mask, of known depth, and as far from depth edges."""
+    window = scaled_window(border_px, mask.shape[1])
     inside = cv2.erode(mask.numpy().astype(np.uint8), window, borderType=cv2.BORDER_REPLICATE) > 0
     z = depth.numpy()
     edge = cv2.dilate(z, window) > (1 + EDGE_JUMP) * cv2.erode(z, window)
@@ -171,5 +171,5 @@ def _certain(mask: Bool[Tensor, "h w"], depth: Float[Tensor, "h w"], border: int
 
 def _grown(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
     """A mask with its border, where it cannot be trusted."""
-    window = np.ones((2 * MASK_BORDER_PX + 3,) * 2, np.uint8)
+    window = scaled_window(MASK_BORDER_PX, mask.shape[1])
     return torch.from_numpy(cv2.dilate(mask.numpy().astype(np.uint8), window) > 0)

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
+from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.core.observations import Priors, View
@@ -38,8 +39,7 @@ class FitStep:
 LossTerm = Callable[[FitStep], Float[Tensor, ""]]  # unweighted; the weight is the recipe's
 
 
-def certain_pixels(moving: Bool[Tensor, "t h w"], band: int) -> Bool[Tensor, "t h w"]:
-    """Pixels further than `band` px from the border of a mask: there the mask can be trusted."""
-    window = np.ones((2 * band + 1,) * 2, np.uint8)
+def certain_pixels(moving: Bool[Tensor, "t h w"], window: UInt8[ndarray, "k k"]) -> Bool[Tensor, "t h w"]:
+    """Pixels around which a window of ones is all inside or all outside a mask: there the mask can be trusted."""
     masks = moving.numpy().astype(np.uint8)
     return torch.from_numpy(np.stack([(cv2.dilate(mask, window) == cv2.erode(mask, window)) for mask in masks]))

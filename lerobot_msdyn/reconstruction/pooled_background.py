@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.observations import View
-from lerobot_msdyn.core.sampling import evenly
+from lerobot_msdyn.core.sampling import evenly, scaled_px, scaled_window
 from lerobot_msdyn.priors.depth.flying_pixels import clean_recorded_depth
 from lerobot_msdyn.priors.masks.moving import temporal_median
 from lerobot_msdyn.reconstruction.background import MARGIN_PX, SAMPLES, EmptyScene, empty_scene
@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 
 MAX_EPISODES = 8  # that are looked at
 FRAMES_EACH = 20
-MAX_SHIFT_PX = 1.0  # of a camera between episodes that still count as seen by the same
+MAX_SHIFT_PX = 1.0  # of 320, of a camera between episodes that still count as seen by the same
 SURE_FRAMES = 3  # in which a pixel of the pooled episodes must be seen to count
 WEAK_SHARE = 0.25  # of the frames; seen in fewer, a pixel of an episode's empty scene yields to the others
 ALIKE_GREY_LEVELS = 12.0  # difference up to which two pictures show the same
@@ -53,7 +53,7 @@ class SharedBackground:
             camera.world_from_camera[0], self.camera.world_from_camera[0]
         )
         picture = temporal_median(view.rgb[few(len(view.rgb))])[0]
-        return same and shift_px(picture.numpy(), self.empty.rgb.numpy()) < MAX_SHIFT_PX
+        return same and shift_px(picture.numpy(), self.empty.rgb.numpy()) < scaled_px(MAX_SHIFT_PX, camera.width)
 
 
 def same_places(views: list[View]) -> list[list[int]]:
@@ -68,7 +68,7 @@ def same_places(views: list[View]) -> list[list[int]]:
             continue
         picture = temporal_median(view.rgb)[0].numpy()
         shifts = [shift_px(picture, other) for other in pictures]
-        if shifts and min(shifts) < MAX_SHIFT_PX:
+        if shifts and min(shifts) < scaled_px(MAX_SHIFT_PX, view.camera.width):
             groups[int(np.argmin(shifts))].append(number)
         else:
             groups.append([number])
@@ -133,7 +133,7 @@ def adapted(shared: SharedBackground, own: EmptyScene, fresh: Gaussians) -> Gaus
     grid = round(math.sqrt(own.seen.numel() / len(fresh)))
     mine = (shared.empty.seen < SURE_FRAMES) | ((own.depth > 0) & (shared.empty.depth == 0))
     mine |= _differs(match.applied(shared.empty.rgb), shared.empty, own)
-    window = np.ones((2 * MARGIN_PX + 1,) * 2, np.uint8)
+    window = scaled_window(MARGIN_PX, mine.shape[1])
     differs = torch.from_numpy(cv2.dilate(mine.numpy().astype(np.uint8), window) > 0)
     rows = differs[grid // 2 :: grid, grid // 2 :: grid].reshape(-1)
     logger.info("%.1f %% of the shared background is another in this episode", 100 * float(rows.float().mean()))

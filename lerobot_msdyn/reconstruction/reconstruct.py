@@ -37,7 +37,7 @@ from lerobot_msdyn.scene.gaussians import DynamicScene
 
 logger = logging.getLogger(__name__)
 
-ROUGH_BORDER_PX = 2  # with depth that is not sharp: from the border of a mask ...
+ROUGH_BORDER_PX = 2  # of 320; with depth that is not sharp: from the border of a mask ...
 ROUGH_FRAMES = 6  # ... and so few frames are gathered, whose depths disagree
 FURTHER_STEPS = 0.6  # share of the fit's steps that suffices where the static set has been fitted already
 

@@ -1,5 +1,6 @@
 """Loss terms against values worked out by hand."""
 
+import numpy as np
 import pytest
 import torch
 from jaxtyping import Float
@@ -51,7 +52,7 @@ def test_mask_counts_only_certain_pixels() -> None:
 def test_certain_pixels_leave_out_a_band_at_the_border() -> None:
     moving = torch.zeros(1, 1, 9, dtype=torch.bool)
     moving[..., 5:] = True
-    assert certain_pixels(moving, 1)[0, 0].tolist() == [True] * 4 + [False] * 2 + [True] * 3
+    assert certain_pixels(moving, np.ones((3, 3), np.uint8))[0, 0].tolist() == [True] * 4 + [False] * 2 + [True] * 3
 
 
 def test_a_term_of_ones_own_sees_the_scene_and_is_minimised(monkeypatch: pytest.MonkeyPatch) -> None:
