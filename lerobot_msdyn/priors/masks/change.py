@@ -12,7 +12,7 @@ _DARK = 8.0  # grey levels, added to both sides of a ratio
 _EVEN_WINDOW = 5  # px, over which the ratio of brightness should be even
 _MOST = 6.0  # log-odds; no pixel is surer than this
 # Log-odds of "another thing" against "the same, perhaps in the shadow", by logistic regression on true masks of
-# simulated and of ray-cast videos (AV1): weights of the features of `_features`, in their order.
+# simulated and of ray-cast videos (AV1): weights of the features of `Reference.features`, in their order.
 _WEIGHTS = (0.74, 1.42, 0.83, -5.54, 2.11, 2.33)
 _BIAS = -1.09
 
@@ -46,11 +46,11 @@ class Reference:
         neither colour nor texture, a thing can be taken for a shadow.
         """
         odds = np.full(self._noise.shape, _BIAS, np.float32)
-        for weight, feature in zip(_WEIGHTS, self._features(frame), strict=True):
+        for weight, feature in zip(_WEIGHTS, self.features(frame), strict=True):
             odds += np.float32(weight) * feature
         return odds.clip(-_MOST, _MOST)
 
-    def _features(self, frame: UInt8[ndarray, "h w 3"]) -> tuple[ndarray, ...]:
+    def features(self, frame: UInt8[ndarray, "h w 3"]) -> tuple[ndarray, ...]:
         """Unevenness of the ratio over the channels; change of colour beyond that of lightness; unevenness of the ratio
         over neighbours; correlation of texture; distance in noise levels; brightening.
         """
