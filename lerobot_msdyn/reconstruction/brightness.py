@@ -11,8 +11,9 @@ from lerobot_msdyn.core.geometry import project, transform_points
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.priors import Priors
-from lerobot_msdyn.scene.draw import draw, landed
-from lerobot_msdyn.scene.gaussians import DynamicScene, Gaussians
+from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.gaussians import Gaussians
+from lerobot_msdyn.scene.rendering import landed, render_scene
 from lerobot_msdyn.scene.shading import Shading, encode_gain, no_shading
 
 BLUR_PX = 1.5  # noise, and texture that does not fit, are averaged over about this
@@ -107,7 +108,7 @@ def moving_gain(scene: DynamicScene, view: View, priors: Priors, backend: str = 
 def _seen_sums(scene: DynamicScene, view: View, priors: Priors, frame: int, backend: str) -> Float[Tensor, "m 2"]:
     """Blurred brightness recorded and drawn at the pixel of each moving Gaussian; zero where it is not seen."""
     camera, when = view.camera.select([frame]), torch.tensor([frame])
-    drawn = to_device(draw(scene, camera, when, backend), "cpu")
+    drawn = to_device(render_scene(scene, camera, when, backend), "cpu")
     usable = ((drawn.moving[0] > SURE_WEIGHT) & (priors.instances[frame] > 0)).numpy()
     recorded, shown = _grey(view.rgb[frame].numpy()), _grey(255 * drawn.rgb[0].numpy())
     sums = torch.from_numpy(_blurred_sums(recorded, shown, usable))

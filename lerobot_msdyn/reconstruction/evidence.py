@@ -11,8 +11,8 @@ from lerobot_msdyn.core.geometry import project, transform_points
 from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.reconstruction.background import EmptyScene, fill_depth
-from lerobot_msdyn.scene.draw import BEHIND, draw
-from lerobot_msdyn.scene.gaussians import DynamicScene
+from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.rendering import BEHIND, render_scene
 
 SAMPLES = 12  # frames in which the moving Gaussians are looked for
 
@@ -39,7 +39,7 @@ def evidence_of(scene: DynamicScene, camera: CameraTrack, empty: EmptyScene) -> 
         for frame in frames.split(1):
             pose = to_device(camera.select(frame), scene.device)
             means = scene.at(frame).means[0, len(scene.static) :]
-            depth = draw(scene, pose, frame).depth[0]
+            depth = render_scene(scene, pose, frame).depth[0]
             visible += in_front(means, pose, depth, torch.ones_like(depth)).float()
     shown = to_device((camera, fill_depth(empty.depth), empty.seen), scene.device)
     return Evidence(*shown, visible * (scene.frames / len(frames)))

@@ -18,8 +18,9 @@ from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.reconstruction.brightness import moving_gain, static_shading
 from lerobot_msdyn.reconstruction.losses import certain_pixels, depth_loss, mask_loss, rgb_loss
-from lerobot_msdyn.scene.draw import Rendering, draw
-from lerobot_msdyn.scene.gaussians import DynamicScene, Gaussians, with_slope
+from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.gaussians import Gaussians, with_slope
+from lerobot_msdyn.scene.rendering import Rendering, render_scene
 from lerobot_msdyn.scene.shading import no_shading
 
 logger = logging.getLogger(__name__)
@@ -112,7 +113,7 @@ def fit(
         if step == int(config.moving_gain_from * config.steps) and len(scene.moving) > 0:
             scene = _with_moving_gain(scene, view, priors, backend)
         frames = next(order).to(scene.device)
-        terms = targets.terms(draw(scene, targets.view.camera.select(frames), frames, backend), frames)
+        terms = targets.terms(render_scene(scene, targets.view.camera.select(frames), frames, backend), frames)
         loss = torch.stack([getattr(config.weights, name) * term for name, term in terms.items()]).sum()
         _check(loss, step, frames)
         optimizer.zero_grad(set_to_none=True)
@@ -132,7 +133,7 @@ def fit(
 def psnr(scene: DynamicScene, view: View, frames: Int[Tensor, " b"], backend: str = "auto") -> float:
     """Peak signal-to-noise ratio (dB) of the drawn against the recorded pictures, which are on one device."""
     frames = frames.to(view.rgb.device)
-    drawn = draw(scene, view.camera.select(frames), frames, backend).rgb.clamp(0, 1)
+    drawn = render_scene(scene, view.camera.select(frames), frames, backend).rgb.clamp(0, 1)
     error = (drawn - view.rgb[frames].float() / 255).square().mean()
     return float(-10 * torch.log10(error.clamp(min=1e-10)))
 

@@ -23,7 +23,8 @@ from lerobot_msdyn.reconstruction.background import (
     fill_depth,
     pixel_gaussians,
 )
-from lerobot_msdyn.scene.gaussians import DynamicScene, Gaussians, concatenate, isotropic
+from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.gaussians import Gaussians, concatenate, isotropic
 
 MASK_BORDER_PX = 1  # pixels along the border of a mask mix two surfaces
 FRONT_MARGIN = 0.01  # a point nearer than this share of the recorded depth is in front of it

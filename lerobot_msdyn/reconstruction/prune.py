@@ -10,8 +10,8 @@ from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.core.serialise import to_device
-from lerobot_msdyn.scene.draw import draw, landed
-from lerobot_msdyn.scene.gaussians import DynamicScene
+from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.rendering import landed, render_scene
 
 logger = logging.getLogger(__name__)
 
@@ -53,7 +53,7 @@ def _compared(
     """Which of the moving set are to be seen at a frame, and which have another colour than the pixels there."""
     snapshot = scene.at(frame, camera.world_from_camera[:, :3, 3])
     means, colours = snapshot.means[0, len(scene.static) :], snapshot.rgb[0, len(scene.static) :]
-    row, column, visible = landed(means, camera, draw(scene, camera, frame).depth[0])
+    row, column, visible = landed(means, camera, render_scene(scene, camera, frame).depth[0])
     height, width = recorded.shape[:2]
     error = torch.full_like(means[:, 0], float("inf"))
     for down in (-1, 0, 1):

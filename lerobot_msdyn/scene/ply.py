@@ -12,15 +12,9 @@ from torch import Tensor
 from lerobot_msdyn.core.errors import MsdynError
 from lerobot_msdyn.core.geometry import quaternion_multiply, quaternion_to_matrix
 from lerobot_msdyn.motion.model.compose import compose
-from lerobot_msdyn.scene.gaussians import (
-    PATCH_OPACITY,
-    SH_C0,
-    DynamicScene,
-    Gaussians,
-    concatenate,
-    gaussians_from_points,
-    rgb_to_sh,
-)
+from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.gaussians import SH_C0, Gaussians, concatenate, gaussians_from_points, rgb_to_sh
+from lerobot_msdyn.scene.overlay import PATCH_OPACITY
 from lerobot_msdyn.scene.store import SavedScene
 
 _HEADER_BYTES = 64 * 1024  # no header is longer

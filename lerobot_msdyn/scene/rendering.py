@@ -12,7 +12,7 @@ from lerobot_msdyn.core.geometry import project, transform_points
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.render import Raster, rasterize
 from lerobot_msdyn.render.cpu.threads import torch_on_one_thread
-from lerobot_msdyn.scene.gaussians import DynamicScene, Snapshot, patched
+from lerobot_msdyn.scene.dynamic import DynamicScene, Snapshot, patched
 from lerobot_msdyn.scene.overlay import FramePatch
 
 BEHIND = 0.01  # share of a surface's depth by which a point may lie behind it and still be what is seen
@@ -29,7 +29,7 @@ class Rendering:
     extra: Float[Tensor, "t h w"] | None = None  # values of the moving Gaussians, blended like colours
 
 
-def draw(
+def render_scene(
     scene: DynamicScene,
     camera: CameraTrack,
     frames: Tensor,
@@ -38,22 +38,22 @@ def draw(
 ) -> Rendering:
     """The scene at `frames` (int, [b]) through the b poses of `camera`; differentiable.
 
-    `extra` is a value per moving Gaussian to be drawn as well; overlays have one of 1. It is drawn on the scene's
+    `extra` is a value per moving Gaussian to be rendered as well; overlays have one of 1. Runs on the scene's
     device; frames and camera may be on the host.
     """
     if scene.overlay is None:
         camera, frames = to_device((camera, frames), scene.device)
         return _rasterized(_snapshot(scene, camera, frames, extra), camera, scene.near, backend)
     own = len(scene.static) + len(scene.moving)
-    drawn = [
-        draw_patched(scene, camera.select([i]), frame, scene.overlay.patch(frame, own), backend, extra)
+    parts = [
+        render_patched(scene, camera.select([i]), frame, scene.overlay.patch(frame, own), backend, extra)
         for i, frame in enumerate(frames.tolist())
     ]
-    names = [item.name for item in fields(Rendering) if getattr(drawn[0], item.name) is not None]
-    return Rendering(**{name: torch.cat([getattr(one, name) for one in drawn]) for name in names})
+    names = [item.name for item in fields(Rendering) if getattr(parts[0], item.name) is not None]
+    return Rendering(**{name: torch.cat([getattr(one, name) for one in parts]) for name in names})
 
 
-def draw_patched(
+def render_patched(
     scene: DynamicScene,
     camera: CameraTrack,
     frame: int,
@@ -97,7 +97,7 @@ def landed(
 ) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"], Bool[Tensor, " n"]]:
     """Row and column of the pixel of every point (m, world) in a camera of one pose, and whether that pixel shows it.
 
-    It does if the point is inside of the picture, whose drawn depth is `depth` (m), and not behind what is drawn there.
+    It does if the point is inside of the picture, whose rendered depth is `depth` (m), and not behind what is there.
     What is outside is given the nearest pixel of the border.
     """
     height, width = depth.shape
@@ -123,5 +123,5 @@ def render_frames(
     for start in range(0, len(frames), batch):
         part = slice(start, min(start + batch, len(frames)))
         with torch_on_one_thread():
-            drawn = draw(scene, camera.select(part), frames[part], backend, extra)
-        yield drawn
+            rendered = render_scene(scene, camera.select(part), frames[part], backend, extra)
+        yield rendered
