@@ -11,9 +11,9 @@ from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.core.geometry import project, transform_points
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.core.serialise import to_device
+from lerobot_msdyn.core.visibility import projected
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.reconstruction.background import fill_depth, pixel_gaussians
 from lerobot_msdyn.scene.dynamic import DynamicScene
@@ -135,9 +135,6 @@ def _hidden(
 ) -> Bool[Tensor, " g"]:
     """Gaussians on or before the recorded surface: moving ones where it is wrong, static ones where it is replaced."""
     snapshot = to_device(scene.at(when), "cpu")
-    xy, z = project(transform_points(camera.camera_from_world, snapshot.means)[0], camera.intrinsics[0])
-    column, row = xy.floor().long().unbind(-1)
-    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height) & (z > 0)
-    column, row = column.clamp(0, camera.width - 1), row.clamp(0, camera.height - 1)
-    replaced = torch.where(snapshot.moving > 0, wrong[row, column], taken[row, column])
-    return inside & replaced & (z < (1 + THICKNESS) * depth[row, column])
+    seen = projected(snapshot.means[0], camera)
+    replaced = torch.where(snapshot.moving > 0, wrong[seen.pixel], taken[seen.pixel])
+    return replaced & seen.visible(depth, THICKNESS)

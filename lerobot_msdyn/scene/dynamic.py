@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lerobot_msdyn.core.geometry import quaternion_multiply, quaternion_to_matrix
+from lerobot_msdyn.core.geometry import quaternion_conjugate, quaternion_multiply, quaternion_to_matrix
 from lerobot_msdyn.motion.model.compose import Level, compose
 from lerobot_msdyn.scene.gaussians import Gaussians, shaded
 from lerobot_msdyn.scene.overlay import PATCH_OPACITY, FramePatch, Overlay
@@ -113,7 +113,7 @@ class DynamicScene:
         static = self.static.rgb.expand(len(frames), -1, -1)
         moving = self.moving.rgb.expand(len(frames), -1, -1)
         if eye is not None and self.moving.sh.shape[1] > 1:
-            back = quaternion_multiply(self.moving.quats, quats * quats.new_tensor([1.0, -1.0, -1.0, -1.0]))
+            back = quaternion_multiply(self.moving.quats, quaternion_conjugate(quats))
             sight = torch.nn.functional.normalize(means - eye[:, None], dim=-1)
             moving = shaded(self.moving.sh, (quaternion_to_matrix(back) @ sight[..., None])[..., 0])
         if self.shading is not None:

@@ -4,18 +4,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.core.geometry import project, transform_points
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.render import Raster, rasterize
 from lerobot_msdyn.render.cpu.threads import torch_on_one_thread
 from lerobot_msdyn.scene.dynamic import DynamicScene, Snapshot, patched
 from lerobot_msdyn.scene.overlay import FramePatch
-
-BEHIND = 0.01  # share of a surface's depth by which a point may lie behind it and still be what is seen
 
 
 @dataclass(frozen=True)
@@ -90,22 +87,6 @@ def _rasterized(snapshot: Snapshot, camera: CameraTrack, near: float, backend: s
     )
     rgb, moving, *more = raster.features.split([3] + [1] * len(values), dim=-1)
     return Rendering(rgb, raster.depth, raster.alpha, moving[..., 0], more[0][..., 0] if more else None)
-
-
-def landed(
-    points: Float[Tensor, "n 3"], camera: CameraTrack, depth: Float[Tensor, "h w"]
-) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"], Bool[Tensor, " n"]]:
-    """Row and column of the pixel of every point (m, world) in a camera of one pose, and whether that pixel shows it.
-
-    It does if the point is inside of the picture, whose rendered depth is `depth` (m), and not behind what is there.
-    What is outside is given the nearest pixel of the border.
-    """
-    height, width = depth.shape
-    xy, z = project(transform_points(camera.camera_from_world[0], points), camera.intrinsics[0])
-    column, row = xy.floor().long().unbind(-1)
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (z > 0)
-    column, row = column.clamp(0, width - 1), row.clamp(0, height - 1)
-    return row, column, inside & (z < (1 + BEHIND) * depth[row, column])
 
 
 @torch.no_grad()
