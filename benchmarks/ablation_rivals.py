@@ -18,7 +18,7 @@ from lerobot_msdyn.motion.field import DeformationField
 from lerobot_msdyn.motion.model.bases import MotionLevel
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.reconstruction.background import EmptyScene
-from lerobot_msdyn.scene.gaussians import DynamicScene
+from lerobot_msdyn.scene.dynamic import DynamicScene
 
 FIELD_RATE = 1e-3  # of a deformation field's layers
 TURN_RATE, SHIFT_RATE = 1e-3, 1e-4  # of the bases' knots; shifts in units of the look-at distance

@@ -37,7 +37,7 @@ from lerobot_msdyn.dataset.read import open_source, read_episode
 from lerobot_msdyn.reconstruction.reconstruct import STEPS, Draft, reconstruct, with_steps
 from lerobot_msdyn.reconstruction.self_check import decibels
 from lerobot_msdyn.render.devices import chosen_device
-from lerobot_msdyn.scene.draw import render_frames
+from lerobot_msdyn.scene.rendering import render_frames
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.dataset import write_dataset
 from lerobot_msdyn.views.new_cameras import new_cameras

@@ -9,7 +9,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 _HOMES = {
     "CameraTrack": "core.cameras",
-    "DynamicScene": "scene.gaussians",
+    "DynamicScene": "scene.dynamic",
     "Episode": "dataset.read",
     "Gaussians": "scene.gaussians",
     "MixedViews": "training",
@@ -22,13 +22,13 @@ _HOMES = {
     "fit": "reconstruction.fit",
     "initialise": "reconstruction.initialise",
     "load_recipe": "core.cli",
-    "load_scene": "scene.gaussians",
+    "load_scene": "scene.store",
     "open_source": "dataset.read",
     "rasterize": "render",
     "read_episode": "dataset.read",
     "reconstruct": "reconstruction.reconstruct",
-    "render_frames": "scene.draw",
-    "save_scene": "scene.gaussians",
+    "render_frames": "scene.rendering",
+    "save_scene": "scene.store",
 }
 __all__ = sorted(_HOMES)
 

@@ -16,7 +16,7 @@ from lerobot_msdyn.dataset.encode import stage_pictures
 from lerobot_msdyn.dataset.read import read_episode
 from lerobot_msdyn.reconstruction.reconstruct import FURTHER_STEPS, reconstruct
 from lerobot_msdyn.render.devices import chosen_device
-from lerobot_msdyn.scene.gaussians import DynamicScene
+from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.views.pictures import new_pictures, on_device
 
 PROBE_FRAMES = 24

@@ -5,7 +5,7 @@ wxyz, transforms named `a_from_b` so that `a_from_b @ b_from_c` reads as it work
 """
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from kornia.geometry.conversions import (
     axis_angle_to_rotation_matrix,
     quaternion_to_rotation_matrix,
@@ -64,6 +64,11 @@ def quaternion_multiply(p: Float[Tensor, "*#batch 4"], q: Float[Tensor, "*#batch
     )
 
 
+def quaternion_conjugate(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
+    """Opposite rotations of unit quaternions wxyz."""
+    return quats * quats.new_tensor([1.0, -1.0, -1.0, -1.0])
+
+
 def se3(rotation: Float[Tensor, "*batch 3 3"], translation: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4 4"]:
     """Homogeneous matrices [R | t; 0 1]."""
     out = torch.zeros(*translation.shape[:-1], 4, 4, dtype=translation.dtype, device=translation.device)
@@ -101,6 +106,12 @@ def unproject(
     """Camera-space points of pixels `xy` at z-depth `depth`."""
     rays = torch.cat((xy, torch.ones_like(xy[..., :1])), dim=-1) @ torch.linalg.inv(intrinsics).transpose(-1, -2)
     return rays * depth[..., None]
+
+
+def nearest_pixel(xy: Float[Tensor, "*n 2"], width: int, height: int) -> tuple[Int[Tensor, "*n"], Int[Tensor, "*n"]]:
+    """Row and column of the pixel that holds each image point (px); of the nearest one of the border if none does."""
+    column, row = xy.floor().long().unbind(-1)
+    return row.clamp(0, height - 1), column.clamp(0, width - 1)
 
 
 def pixel_grid(height: int, width: int, device: torch.device | str = "cpu") -> Float[Tensor, "height width 2"]:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.render.types import COVARIANCE_BLUR
-from lerobot_msdyn.scene.gaussians import DynamicScene
+from lerobot_msdyn.scene.dynamic import DynamicScene
 
 
 def enlarged(scene: DynamicScene, camera: CameraTrack, ratio: float) -> DynamicScene:

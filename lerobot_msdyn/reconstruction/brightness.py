@@ -7,13 +7,14 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from lerobot_msdyn.core.geometry import project, transform_points
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.core.sampling import scaled_px, scaled_window
 from lerobot_msdyn.core.serialise import to_device
+from lerobot_msdyn.core.visibility import projected
 from lerobot_msdyn.priors import Priors
-from lerobot_msdyn.scene.draw import draw, landed
-from lerobot_msdyn.scene.gaussians import DynamicScene, Gaussians
+from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.gaussians import Gaussians
+from lerobot_msdyn.scene.rendering import render_scene
 from lerobot_msdyn.scene.shading import Shading, encode_gain, no_shading
 
 BLUR_PX = 1.5  # of 320: noise, and texture that does not fit, are averaged over about this
@@ -45,8 +46,7 @@ def static_shading(
         if t > 0:
             del sums[0]
     camera = view.camera.select([0])
-    xy, _ = project(transform_points(camera.camera_from_world[0], static.means), camera.intrinsics[0])
-    places = xy / torch.tensor([camera.width, camera.height]) * 2 - 1
+    places = projected(static.means, camera).xy / torch.tensor([camera.width, camera.height]) * 2 - 1
     return Shading(torch.stack(fields), places, no_shading(0, moving, frames).moving)
 
 
@@ -108,15 +108,15 @@ def moving_gain(scene: DynamicScene, view: View, priors: Priors, backend: str = 
 def _seen_sums(scene: DynamicScene, view: View, priors: Priors, frame: int, backend: str) -> Float[Tensor, "m 2"]:
     """Blurred brightness recorded and drawn at the pixel of each moving Gaussian; zero where it is not seen."""
     camera, when = view.camera.select([frame]), torch.tensor([frame])
-    drawn = to_device(draw(scene, camera, when, backend), "cpu")
+    drawn = to_device(render_scene(scene, camera, when, backend), "cpu")
     usable = ((drawn.moving[0] > SURE_WEIGHT) & (priors.instances[frame] > 0)).numpy()
     recorded, shown = _grey(view.rgb[frame].numpy()), _grey(255 * drawn.rgb[0].numpy())
     sums = torch.from_numpy(_blurred_sums(recorded, shown, usable))
     means = scene.at(when).means[0, len(scene.static) :].cpu()
-    row, column, visible = landed(means, camera, drawn.depth[0])
-    own = sums[row, column]
-    seen = visible & (own[:, 2] > SURE_WEIGHT)
-    return own[:, :2] * seen[:, None]
+    seen = projected(means, camera)
+    own = sums[seen.pixel]
+    compared = seen.visible(drawn.depth[0]) & (own[:, 2] > SURE_WEIGHT)
+    return own[:, :2] * compared[:, None]
 
 
 def _at_every_frame(

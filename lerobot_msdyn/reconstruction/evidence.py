@@ -7,12 +7,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.core.geometry import project, transform_points
+from lerobot_msdyn.core.geometry import nearest_pixel
 from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.core.serialise import to_device
+from lerobot_msdyn.core.visibility import TOLERANCE, projected
 from lerobot_msdyn.reconstruction.background import EmptyScene, fill_depth
-from lerobot_msdyn.scene.draw import BEHIND, draw
-from lerobot_msdyn.scene.gaussians import DynamicScene
+from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.rendering import render_scene
 
 SAMPLES = 12  # frames in which the moving Gaussians are looked for
 
@@ -39,7 +40,7 @@ def evidence_of(scene: DynamicScene, camera: CameraTrack, empty: EmptyScene) -> 
         for frame in frames.split(1):
             pose = to_device(camera.select(frame), scene.device)
             means = scene.at(frame).means[0, len(scene.static) :]
-            depth = draw(scene, pose, frame).depth[0]
+            depth = render_scene(scene, pose, frame).depth[0]
             visible += in_front(means, pose, depth, torch.ones_like(depth)).float()
     shown = to_device((camera, fill_depth(empty.depth), empty.seen), scene.device)
     return Evidence(*shown, visible * (scene.frames / len(frames)))
@@ -53,23 +54,18 @@ def in_front(
     0 where the point is outside of the view or behind what the view shows.
     """
     height, width = depth.shape
-    xy, z = project(transform_points(camera.camera_from_world[0], points), camera.intrinsics[0])
-    inside = (z > 0) & (xy >= 0).all(-1) & (xy[:, 0] < width) & (xy[:, 1] < height)
-    corner = (torch.nan_to_num(xy) - 0.5).floor()
-    farthest, most = torch.zeros_like(z), torch.zeros_like(z)
+    seen = projected(points, camera)
+    x, y = (torch.nan_to_num(seen.xy) - 0.5).floor().unbind(-1)
+    farthest, most = torch.zeros_like(seen.z), torch.zeros_like(seen.z)
     for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
-        column = (corner[:, 0] + right).clamp(0, width - 1).long()
-        row = (corner[:, 1] + down).clamp(0, height - 1).long()
-        farthest = torch.maximum(farthest, depth[row, column])
-        most = torch.maximum(most, value[row, column].float())
-    return torch.where(inside & (z <= farthest * (1 + BEHIND)), most, 0).long()
+        around = nearest_pixel(torch.stack((x + right, y + down), dim=-1), width, height)
+        farthest = torch.maximum(farthest, depth[around])
+        most = torch.maximum(most, value[around].float())
+    return torch.where(seen.inside & (seen.z <= farthest * (1 + TOLERANCE)), most, 0).long()
 
 
 def is_behind(evidence: Evidence, places: Float[Tensor, "n 3"]) -> bool:
     """Whether any of some places (m, world) is behind what stands still before the recorded camera."""
     camera = evidence.camera.select(slice(1))
-    places = places.to(evidence.depth.device)
-    xy, z = project(transform_points(camera.camera_from_world[0], places), camera.intrinsics[0])
-    inside = (z > 0) & (xy >= 0).all(-1) & (xy[:, 0] < camera.width) & (xy[:, 1] < camera.height)
-    column, row = xy[inside].long().unbind(-1)
-    return bool((z[inside] > evidence.depth[row, column]).any())
+    seen = projected(places.to(evidence.depth.device), camera)
+    return bool((seen.inside & (seen.z > evidence.depth[seen.pixel])).any())

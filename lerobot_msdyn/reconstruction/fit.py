@@ -19,8 +19,9 @@ from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.reconstruction.brightness import moving_gain, static_shading
 from lerobot_msdyn.reconstruction.loss_terms import FitStep, Targets, certain_pixels
-from lerobot_msdyn.scene.draw import draw
-from lerobot_msdyn.scene.gaussians import DynamicScene, Gaussians, with_slope
+from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.gaussians import Gaussians, with_slope
+from lerobot_msdyn.scene.rendering import render_scene
 from lerobot_msdyn.scene.shading import no_shading
 
 logger = logging.getLogger(__name__)
@@ -98,7 +99,7 @@ def fit(
         if step == int(config.moving_gain_from * config.steps) and len(scene.moving) > 0:
             scene = _with_moving_gain(scene, view, priors, backend)
         frames = next(order).to(scene.device)
-        rendering = draw(scene, targets.view.camera.select(frames), frames, backend)
+        rendering = render_scene(scene, targets.view.camera.select(frames), frames, backend)
         now = FitStep(scene, frames, rendering, targets)
         values = {name: term(now) for name, (term, _) in terms.items()}
         optimizer.zero_grad(set_to_none=True)
@@ -121,7 +122,7 @@ def fit(
 def psnr(scene: DynamicScene, view: View, frames: Int[Tensor, " b"], backend: str = "auto") -> float:
     """Peak signal-to-noise ratio (dB) of the drawn against the recorded pictures, which are on one device."""
     frames = frames.to(view.rgb.device)
-    drawn = draw(scene, view.camera.select(frames), frames, backend).rgb.clamp(0, 1)
+    drawn = render_scene(scene, view.camera.select(frames), frames, backend).rgb.clamp(0, 1)
     error = (drawn - view.rgb[frames].float() / 255).square().mean()
     return float(-10 * torch.log10(error.clamp(min=1e-10)))
 

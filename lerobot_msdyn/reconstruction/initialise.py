@@ -10,9 +10,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lerobot_msdyn.core.config import MotionConfig, SceneConfig
-from lerobot_msdyn.core.geometry import project, quaternion_multiply, transform_points
+from lerobot_msdyn.core.geometry import quaternion_conjugate, quaternion_multiply
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.core.sampling import evenly, scaled_window
+from lerobot_msdyn.core.visibility import projected
 from lerobot_msdyn.motion.estimate import SceneMotion, scene_motion
 from lerobot_msdyn.motion.to_video.register import Recording
 from lerobot_msdyn.priors import Priors
@@ -23,7 +24,8 @@ from lerobot_msdyn.reconstruction.background import (
     fill_depth,
     pixel_gaussians,
 )
-from lerobot_msdyn.scene.gaussians import DynamicScene, Gaussians, concatenate, isotropic
+from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.gaussians import Gaussians, concatenate, isotropic
 
 MASK_BORDER_PX = 2  # of 320: so far from a mask its border cannot be trusted
 FRONT_MARGIN = 0.01  # a point nearer than this share of the recorded depth is in front of it
@@ -117,18 +119,13 @@ def contradicted(
     many such frames among those in which it is inside the image are held against it.
     """
     wrong, inside = torch.zeros(len(points)), torch.zeros(len(points))
-    height, width = priors.depth.shape[1:]
     for frame in frames:
         world = motion.moved(points, part, torch.tensor([frame]))[0][0]
-        camera = view.camera.select([frame])
-        xy, z = project(transform_points(camera.camera_from_world, world[None])[0], camera.intrinsics[0])
-        column, row = xy.floor().long().unbind(-1)
-        shown = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (z > 0)
-        column, row = column.clamp(0, width - 1), row.clamp(0, height - 1)
-        surface = priors.depth[frame, row, column]
-        still = _grown(priors.instances[frame] > 0)[row, column].logical_not()
-        wrong += shown & still & (surface > 0) & (z < (1 - FRONT_MARGIN) * surface)
-        inside += shown
+        seen = projected(world, view.camera.select([frame]))
+        surface = priors.depth[frame][seen.pixel]
+        still = _grown(priors.instances[frame] > 0)[seen.pixel].logical_not()
+        wrong += still & (surface > 0) & seen.visible(priors.depth[frame], -FRONT_MARGIN)
+        inside += seen.inside
     return wrong > MAX_CONTRADICTIONS * inside
 
 
@@ -138,8 +135,8 @@ def to_canonical(
     """Gaussians seen at a frame, carried back to the canonical frame by the motion of their part, and that part."""
     means, part = motion.to_canonical(gaussians.means, frame, instance)
     turn = motion.moved(means, part, torch.tensor([frame]))[1][0]
-    back = turn * turn.new_tensor([1.0, -1.0, -1.0, -1.0])
-    return replace(gaussians, means=means, quats=quaternion_multiply(back, gaussians.quats)), part
+    quats = quaternion_multiply(quaternion_conjugate(turn), gaussians.quats)
+    return replace(gaussians, means=means, quats=quats), part
 
 
 def merge_voxels(gaussians: Gaussians, part: Int[Tensor, " n"], voxel: float) -> tuple[Gaussians, Int[Tensor, " m"]]:

@@ -11,8 +11,8 @@ from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.core.observations import Priors, View
-from lerobot_msdyn.scene.draw import Rendering
-from lerobot_msdyn.scene.gaussians import DynamicScene
+from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.rendering import Rendering
 
 
 @dataclass(frozen=True)

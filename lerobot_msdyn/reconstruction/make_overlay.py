@@ -11,14 +11,14 @@ from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.core.geometry import project, transform_points
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.core.serialise import to_device
+from lerobot_msdyn.core.visibility import projected
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.reconstruction.background import fill_depth, pixel_gaussians
-from lerobot_msdyn.scene.draw import Rendering, draw, draw_patched
-from lerobot_msdyn.scene.gaussians import DynamicScene
+from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.overlay import FramePatch, Overlay, packed
+from lerobot_msdyn.scene.rendering import Rendering, render_patched, render_scene
 
 logger = logging.getLogger(__name__)
 
@@ -51,8 +51,8 @@ def unexplained(scene: DynamicScene, view: View, priors: Priors, backend: str = 
         camera, when = view.camera.select([frame]), torch.tensor([frame])
         depth = fill_depth(priors.depth[frame])
         if still is None or not view.camera.is_static:
-            still = draw(scene.still(), camera, when, backend).depth[0].cpu()
-        drawn = to_device(draw(scene, camera, when, backend), "cpu")
+            still = render_scene(scene.still(), camera, when, backend).depth[0].cpu()
+        drawn = to_device(render_scene(scene, camera, when, backend), "cpu")
         wrong = _wrong(drawn, view.rgb[frame].float() / 255, depth.numpy(), tolerance)
         taken = wrong & ~_behind_an_edge(depth.numpy(), still.numpy())
         patches.append(_patch(scene, view, depth, frame, wrong, taken, backend))
@@ -121,7 +121,7 @@ def _patch(
     first = FramePatch(pixels.means, pixels.quats, log_scales, recorded, hidden)
     if len(first) == 0:
         return first
-    drawn = draw_patched(scene, camera, frame, first, backend).rgb[0].cpu().reshape(-1, 3)[chosen]
+    drawn = render_patched(scene, camera, frame, first, backend).rgb[0].cpu().reshape(-1, 3)[chosen]
     return FramePatch(pixels.means, pixels.quats, log_scales, (2 * recorded - drawn).clamp(0, 1.5), hidden)
 
 
@@ -135,9 +135,6 @@ def _hidden(
 ) -> Bool[Tensor, " g"]:
     """Gaussians on or before the recorded surface: moving ones where it is wrong, static ones where it is replaced."""
     snapshot = to_device(scene.at(when), "cpu")
-    xy, z = project(transform_points(camera.camera_from_world, snapshot.means)[0], camera.intrinsics[0])
-    column, row = xy.floor().long().unbind(-1)
-    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height) & (z > 0)
-    column, row = column.clamp(0, camera.width - 1), row.clamp(0, camera.height - 1)
-    replaced = torch.where(snapshot.moving > 0, wrong[row, column], taken[row, column])
-    return inside & replaced & (z < (1 + THICKNESS) * depth[row, column])
+    seen = projected(snapshot.means[0], camera)
+    replaced = torch.where(snapshot.moving > 0, wrong[seen.pixel], taken[seen.pixel])
+    return replaced & seen.visible(depth, THICKNESS)

@@ -10,8 +10,9 @@ from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.core.serialise import to_device
-from lerobot_msdyn.scene.draw import draw, landed
-from lerobot_msdyn.scene.gaussians import DynamicScene
+from lerobot_msdyn.core.visibility import projected
+from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.rendering import render_scene
 
 logger = logging.getLogger(__name__)
 
@@ -53,11 +54,12 @@ def _compared(
     """Which of the moving set are to be seen at a frame, and which have another colour than the pixels there."""
     snapshot = scene.at(frame, camera.world_from_camera[:, :3, 3])
     means, colours = snapshot.means[0, len(scene.static) :], snapshot.rgb[0, len(scene.static) :]
-    row, column, visible = landed(means, camera, draw(scene, camera, frame).depth[0])
+    seen = projected(means, camera)
+    row, column = seen.pixel
     height, width = recorded.shape[:2]
     error = torch.full_like(means[:, 0], float("inf"))
     for down in (-1, 0, 1):
         for right in (-1, 0, 1):
             pixel = recorded[(row + down).clamp(0, height - 1), (column + right).clamp(0, width - 1)]
             error = torch.minimum(error, (pixel - colours).abs().mean(-1))
-    return visible, error > COLOUR_ERROR
+    return seen.visible(render_scene(scene, camera, frame).depth[0]), error > COLOUR_ERROR

@@ -33,7 +33,7 @@ from lerobot_msdyn.reconstruction.share_background import moving_in_few, share
 from lerobot_msdyn.reconstruction.windows import windows
 from lerobot_msdyn.render.cpu.threads import torch_on_one_thread
 from lerobot_msdyn.render.devices import chosen_device
-from lerobot_msdyn.scene.gaussians import DynamicScene
+from lerobot_msdyn.scene.dynamic import DynamicScene
 
 logger = logging.getLogger(__name__)
 

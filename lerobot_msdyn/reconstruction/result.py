@@ -10,7 +10,7 @@ from torch import Tensor
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.reconstruction.evidence import Evidence
 from lerobot_msdyn.reconstruction.self_check import SelfCheck
-from lerobot_msdyn.scene.gaussians import DynamicScene
+from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.store import SavedScene, SceneSource
 
 

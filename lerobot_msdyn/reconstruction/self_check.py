@@ -20,8 +20,8 @@ from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.priors import Priors
-from lerobot_msdyn.scene.draw import draw
-from lerobot_msdyn.scene.gaussians import DynamicScene
+from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.rendering import render_scene
 
 CHECKED_FRAMES = 3  # frames that are looked at where none was held out
 STILL_PX = 5  # side of the square around a pixel in which nothing may move for it to stand still
@@ -66,9 +66,9 @@ def self_check(scene: DynamicScene, view: View, priors: Priors, held_out: Int[Te
     if len(held_out) == 0 and total > CHECKED_FRAMES + 1:
         frames = frames[1:-1]
     camera = view.camera.select(frames)
-    drawn = to_device(draw(scene, camera, frames), "cpu")
+    drawn = to_device(render_scene(scene, camera, frames), "cpu")
     recorded = view.rgb[frames].float() / 255
-    pictures = draw(replace(scene, overlay=None), camera, frames).rgb.clamp(0, 1).cpu()
+    pictures = render_scene(replace(scene, overlay=None), camera, frames).rgb.clamp(0, 1).cpu()
     wrong, moving = (pictures - recorded).square().mean(-1), priors.instances[frames] > 0
     following = (frames + 1).clamp(max=total - 1)
     still = stands_still(priors.instances[frames] > 0) & stands_still(priors.instances[following] > 0)

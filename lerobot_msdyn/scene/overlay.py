@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Float16, Int, UInt8
 from torch import Tensor
 
+PATCH_OPACITY = 0.95  # of the Gaussians
+
 
 @dataclass(frozen=True)
 class FramePatch:
@@ -17,7 +19,7 @@ class FramePatch:
     quats: Float[Tensor, "n 4"]  # wxyz
     log_scales: Float[Tensor, "n 3"]  # log of standard deviations in m
     rgb: Float[Tensor, "n 3"]  # 0..1
-    hidden: Bool[Tensor, " g"]  # the scene's Gaussians, static ones first, that are not drawn
+    hidden: Bool[Tensor, " g"]  # the scene's Gaussians, static ones first, that are not rendered
 
     def __len__(self) -> int:
         return self.means.shape[0]

@@ -10,17 +10,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lerobot_msdyn.core.errors import MsdynError
-from lerobot_msdyn.core.geometry import quaternion_multiply, quaternion_to_matrix
+from lerobot_msdyn.core.geometry import quaternion_conjugate, quaternion_multiply, quaternion_to_matrix
 from lerobot_msdyn.motion.model.compose import compose
-from lerobot_msdyn.scene.gaussians import (
-    PATCH_OPACITY,
-    SH_C0,
-    DynamicScene,
-    Gaussians,
-    concatenate,
-    gaussians_from_points,
-    rgb_to_sh,
-)
+from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.gaussians import SH_C0, Gaussians, concatenate, gaussians_from_points, rgb_to_sh
+from lerobot_msdyn.scene.overlay import PATCH_OPACITY
 from lerobot_msdyn.scene.store import SavedScene
 
 _HEADER_BYTES = 64 * 1024  # no header is longer
@@ -31,7 +25,7 @@ def gaussians_at(scene: DynamicScene, frame: int) -> Gaussians:
     time = torch.tensor([frame])
     static, moving = scene.static, scene.moving
     means, quats = compose(moving.means, moving.quats, scene.levels, scene.indices, scene.logits, time)
-    turn = quaternion_to_matrix(quaternion_multiply(quats[0], moving.quats * torch.tensor([1.0, -1, -1, -1])))
+    turn = quaternion_to_matrix(quaternion_multiply(quats[0], quaternion_conjugate(moving.quats)))
     sh = [static.sh, _turned(moving.sh, turn)]
     if scene.shading is not None:
         gains = (scene.shading.static_gain(time)[0], scene.shading.moving_gain(time)[0])

@@ -3,13 +3,13 @@
 import json
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import torch
 from jaxtyping import Int
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file
 from safetensors.torch import save as save_tensors
 from torch import Tensor
@@ -17,10 +17,17 @@ from torch import Tensor
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.errors import MsdynError
 from lerobot_msdyn.core.files import write_whole, writing
-from lerobot_msdyn.scene.gaussians import DynamicScene, load_scene, save_scene
+from lerobot_msdyn.motion.field import DeformationField
+from lerobot_msdyn.motion.model.bases import MotionLevel
+from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.gaussians import Gaussians
+from lerobot_msdyn.scene.overlay import Overlay
+from lerobot_msdyn.scene.shading import Shading
 
 FOLDER = Path("msdyn_scenes")  # inside an output dataset
-SCHEMA_VERSION = 1  # of the folder of one camera; the scenes in it have their own (scene.SCHEMA_VERSION)
+FOLDER_SCHEMA = 1  # of the folder of one camera
+SCENE_SCHEMA = 3  # of one scene's file
+LEVEL_KINDS: dict[str, type] = {"bases": MotionLevel, "field": DeformationField}
 _HEADER, _CAMERA, _WINDOW = "scene.json", "camera.safetensors", "window_{:03d}.safetensors"
 
 
@@ -77,7 +84,7 @@ def save(scene: SavedScene, root: Path) -> Path:
         "world_from_camera": scene.camera.world_from_camera.contiguous(),
     }
     header = {
-        "schema": SCHEMA_VERSION,
+        "schema": FOLDER_SCHEMA,
         "source": asdict(scene.source),
         "frames": len(scene),
         "starts": list(scene.starts),
@@ -146,10 +153,8 @@ def read_header(folder: Path) -> dict[str, Any]:
         raise MsdynError(
             f"{path}: not the header of a saved scene ({type(error).__name__}: {error}); docs/scenes.md has the format"
         ) from error
-    if schema != SCHEMA_VERSION:
-        raise MsdynError(
-            f"{path}: schema is {schema}; expected {SCHEMA_VERSION}; make it again with --save_scenes true"
-        )
+    if schema != FOLDER_SCHEMA:
+        raise MsdynError(f"{path}: schema is {schema}; expected {FOLDER_SCHEMA}; make it again with --save_scenes true")
     return dict(header)
 
 
@@ -179,3 +184,51 @@ def list_scenes(folder: Path) -> dict[int, dict[str, Path]]:
         episode = int(header.parent.parent.name.removeprefix("episode_"))
         found.setdefault(episode, {})[header.parent.name] = header.parent
     return found
+
+
+def save_scene(scene: DynamicScene, path: Path) -> None:
+    """Write a scene as one safetensors file, atomically."""
+    names = {kind: name for name, kind in LEVEL_KINDS.items()}
+    header = {
+        "schema": SCENE_SCHEMA,
+        "levels": [names[type(level)] for level in scene.levels],
+        "frames": scene.frames,
+        "near": scene.near,
+    }
+    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in scene.tensors().items()}
+    write_whole(path, save_tensors(tensors, metadata={"lerobot_msdyn": json.dumps(header)}))
+
+
+def load_scene(path: Path) -> DynamicScene:
+    """Read a scene that `save_scene` wrote.
+
+    Raises:
+        MsdynError: the file is absent, damaged, or of another schema.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = json.loads((file.metadata() or {}).get("lerobot_msdyn", "{}"))
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (OSError, ValueError, SafetensorError) as error:
+        raise MsdynError(f"{path}: not a readable scene file ({error})") from error
+    if header.get("schema") != SCENE_SCHEMA:
+        raise MsdynError(f"{path}: scene schema is {header.get('schema')}; expected {SCENE_SCHEMA}; fit it again")
+    kinds = header.get("levels", [])
+
+    def part(name: str, kind: type) -> dict[str, Tensor]:
+        return {item.name: tensors[f"{name}.{item.name}"] for item in fields(kind)}
+
+    try:
+        return DynamicScene(
+            static=Gaussians(**part("static", Gaussians)),
+            moving=Gaussians(**part("moving", Gaussians)),
+            levels=tuple(LEVEL_KINDS[kind](**part(f"levels.{i}", LEVEL_KINDS[kind])) for i, kind in enumerate(kinds)),
+            indices=tuple(tensors[f"levels.{i}.indices"] for i in range(len(kinds))),
+            logits=tuple(tensors[f"levels.{i}.logits"] for i in range(len(kinds))),
+            frames=header["frames"],
+            shading=Shading(**part("shading", Shading)) if "shading.field" in tensors else None,
+            near=header["near"],
+            overlay=Overlay(**part("overlay", Overlay)) if "overlay.first" in tensors else None,
+        )
+    except KeyError as error:
+        raise MsdynError(f"{path}: not a readable scene file ({error} is missing)") from error

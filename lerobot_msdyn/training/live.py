@@ -11,8 +11,8 @@ from torch import Tensor
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.motion.model.bases import MotionLevel, level_affines
 from lerobot_msdyn.render import rasterize
-from lerobot_msdyn.scene.gaussians import PATCH_OPACITY, DynamicScene
-from lerobot_msdyn.scene.overlay import Overlay
+from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.overlay import PATCH_OPACITY, Overlay
 from lerobot_msdyn.scene.store import SavedScene
 from lerobot_msdyn.training.posing import pose
 from lerobot_msdyn.views.coverage import HOLE_ALPHA

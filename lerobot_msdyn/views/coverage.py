@@ -16,7 +16,7 @@ from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.geometry import transform_points, unproject_image
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.reconstruction.evidence import Evidence, in_front
-from lerobot_msdyn.scene.draw import Rendering
+from lerobot_msdyn.scene.rendering import Rendering
 
 HOLE_ALPHA = 0.5  # below this opacity nothing is known to be there
 

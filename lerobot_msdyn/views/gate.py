@@ -15,7 +15,7 @@ from lerobot_msdyn.core.config import GateConfig
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.reconstruction.result import FittedWindow
 from lerobot_msdyn.reconstruction.self_check import decibels, flicker, sharpness, stands_still
-from lerobot_msdyn.scene.draw import Rendering, draw
+from lerobot_msdyn.scene.rendering import Rendering, render_scene
 from lerobot_msdyn.views.coverage import Coverage, coverage_of
 from lerobot_msdyn.views.expected_error import Expected, expected_error
 
@@ -72,7 +72,7 @@ def judge(windows: Sequence[FittedWindow], camera: CameraTrack) -> Scores:
         drawn, found = _draw(window, poses)
         pictures = drawn.rgb.clamp(0, 1)
         after = (check.frames + 1).clamp(max=window.scene.frames - 1)
-        following = to_device(draw(window.scene, poses, after), "cpu")
+        following = to_device(render_scene(window.scene, poses, after), "cpu")
         still = stands_still(drawn.moving > 0.05) & stands_still(following.moving > 0.05)
         steady += len(poses) * flicker(pictures, following.rgb.clamp(0, 1), still)
         own += len(poses) * check.flicker
@@ -144,7 +144,7 @@ def _plain(value: Any) -> Any:
 
 def _draw(window: FittedWindow, poses: CameraTrack) -> tuple[Rendering, list[Coverage]]:
     """The checked frames through other poses, and what is known about their pixels; on the host."""
-    drawn = draw(window.scene, poses, window.self_check.frames, extra=window.evidence.moving_frames)
+    drawn = render_scene(window.scene, poses, window.self_check.frames, extra=window.evidence.moving_frames)
     return to_device(drawn, "cpu"), coverage_of(drawn, poses, window.self_check.frames, window.evidence)
 
 

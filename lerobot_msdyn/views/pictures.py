@@ -13,8 +13,8 @@ from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.config import Fill, Recipe
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.reconstruction.result import Reconstruction
-from lerobot_msdyn.scene.draw import Rendering, render_frames
-from lerobot_msdyn.scene.gaussians import DynamicScene
+from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.rendering import Rendering, render_frames
 from lerobot_msdyn.views.coverage import Coverage, coverage_of
 from lerobot_msdyn.views.filling import filled, missing
 

@@ -83,3 +83,14 @@ def test_procrustes_never_reflects(flat: bool) -> None:
     torch.testing.assert_close(torch.linalg.det(found[:3, :3]), torch.tensor(1.0))
     if flat:
         torch.testing.assert_close(g.transform_points(found, source), source, atol=1e-5, rtol=1e-5)
+
+
+def test_a_quaternion_and_its_conjugate_undo_each_other() -> None:
+    quats = torch.nn.functional.normalize(torch.randn(6, 4, generator=torch.Generator().manual_seed(0)), dim=-1)
+    expected = torch.tensor([1.0, 0, 0, 0]).expand(6, 4)
+    torch.testing.assert_close(g.quaternion_multiply(quats, g.quaternion_conjugate(quats)), expected)
+
+
+def test_nearest_pixels() -> None:
+    row, column = g.nearest_pixel(torch.tensor([[0.0, 0.0], [2.99, 1.01], [-0.3, 7.0], [3.0, -9.0]]), 3, 2)
+    assert (row.tolist(), column.tolist()) == ([0, 1, 1, 0], [0, 2, 0, 2])

@@ -9,9 +9,10 @@ from lerobot_msdyn.core.cameras import CameraTrack, intrinsics_from_fov, static_
 from lerobot_msdyn.motion.model.bases import identity_level
 from lerobot_msdyn.reconstruction.antialias import enlarged
 from lerobot_msdyn.reconstruction.background import background_gaussians
-from lerobot_msdyn.scene.draw import draw
-from lerobot_msdyn.scene.gaussians import DynamicScene, isotropic
+from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.gaussians import isotropic
 from lerobot_msdyn.scene.overlay import FramePatch, packed
+from lerobot_msdyn.scene.rendering import render_scene
 
 WIDTH, HEIGHT, RATIO = 32, 24, 5.0
 FAR, SHRUNK = 1.3, 0.3  # m; of a pixel's Gaussian, as a fit makes it that has to reckon with the low-pass filter
@@ -37,7 +38,7 @@ def inside(scene: DynamicScene, camera: CameraTrack, ratio: float) -> torch.Tens
     """Opacity of a picture that many times as large, without its border."""
     larger = camera.resized(round(ratio * WIDTH), round(ratio * HEIGHT))
     border = round(3 * ratio)
-    return draw(scene, larger, torch.tensor([0])).alpha[0, border:-border, border:-border]
+    return render_scene(scene, larger, torch.tensor([0])).alpha[0, border:-border, border:-border]
 
 
 def test_gaps_close(wall: DynamicScene, camera: CameraTrack) -> None:

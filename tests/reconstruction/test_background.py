@@ -15,8 +15,8 @@ from lerobot_msdyn.reconstruction.background import (
     pixel_gaussians,
     surface_frames,
 )
-from lerobot_msdyn.scene.draw import draw
-from lerobot_msdyn.scene.gaussians import DynamicScene
+from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.rendering import render_scene
 from lerobot_msdyn.views.perturbation import orbit_offset
 
 WIDTH, HEIGHT = 32, 24
@@ -77,7 +77,7 @@ def test_the_recorded_camera_sees_the_picture_again(camera: CameraTrack) -> None
         (torch.zeros(0, 1),),
         1,
     )
-    drawn = draw(scene, camera, torch.tensor([0]))
+    drawn = render_scene(scene, camera, torch.tensor([0]))
     inner = (0, slice(3, -3), slice(3, -3))
     assert (drawn.alpha[inner] > 0.95).all()
     assert (drawn.rgb[inner] - median[inner[1:]].float() / 255).abs().mean() < 0.03

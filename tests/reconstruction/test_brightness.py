@@ -11,7 +11,7 @@ from lerobot_msdyn.motion.model.bases import identity_level
 from lerobot_msdyn.priors import PointTracks, Priors
 from lerobot_msdyn.reconstruction.background import background_gaussians, pixel_gaussians
 from lerobot_msdyn.reconstruction.brightness import moving_gain, static_shading
-from lerobot_msdyn.scene.gaussians import DynamicScene
+from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.shading import decode_gain
 
 WIDTH, HEIGHT, FRAMES = 40, 30, 6

@@ -13,7 +13,7 @@ from lerobot_msdyn.motion.model.bases import identity_level
 from lerobot_msdyn.priors import PointTracks, Priors
 from lerobot_msdyn.reconstruction.background import background_gaussians
 from lerobot_msdyn.reconstruction.fit import FitResult, fit, psnr
-from lerobot_msdyn.scene.gaussians import DynamicScene
+from lerobot_msdyn.scene.dynamic import DynamicScene
 
 WIDTH, HEIGHT, FRAMES = 32, 24, 3
 

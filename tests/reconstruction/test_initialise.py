@@ -15,7 +15,8 @@ from lerobot_msdyn.priors import PointTracks, Priors
 from lerobot_msdyn.reconstruction.background import pixel_gaussians
 from lerobot_msdyn.reconstruction.fit import psnr
 from lerobot_msdyn.reconstruction.initialise import contradicted, initialise, merge_voxels, to_canonical
-from lerobot_msdyn.scene.gaussians import DynamicScene, gaussians_from_points
+from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.gaussians import gaussians_from_points
 from lerobot_msdyn.synthetic import make_scene
 
 FRAMES, WIDTH, HEIGHT = 16, 80, 60

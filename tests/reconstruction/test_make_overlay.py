@@ -12,8 +12,9 @@ from lerobot_msdyn.motion.model.bases import identity_level
 from lerobot_msdyn.priors import PointTracks, Priors
 from lerobot_msdyn.reconstruction.background import background_gaussians, pixel_gaussians
 from lerobot_msdyn.reconstruction.make_overlay import unexplained
-from lerobot_msdyn.scene.draw import draw
-from lerobot_msdyn.scene.gaussians import DynamicScene, load_scene, save_scene
+from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.rendering import render_scene
+from lerobot_msdyn.scene.store import load_scene, save_scene
 from lerobot_msdyn.views.perturbation import orbit_offset
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 4
@@ -46,7 +47,7 @@ def recorded() -> tuple[DynamicScene, View, Priors]:
 
 def red(scene: DynamicScene, camera: CameraTrack, frame: int) -> torch.Tensor:
     """Where a picture of the scene is red."""
-    rgb = draw(scene, camera.select([0]), torch.tensor([frame])).rgb[0]
+    rgb = render_scene(scene, camera.select([0]), torch.tensor([frame])).rgb[0]
     return rgb[..., 0] - rgb[..., 1] > 0.3
 
 
@@ -113,4 +114,4 @@ def test_overlays_are_saved(recorded: tuple[DynamicScene, View, Priors], tmp_pat
     mended = dataclasses.replace(scene, overlay=unexplained(scene, view, priors))
     save_scene(mended, tmp_path / "scene.safetensors")
     again, frames = load_scene(tmp_path / "scene.safetensors"), torch.arange(FRAMES)
-    assert torch.equal(draw(again, view.camera, frames).rgb, draw(mended, view.camera, frames).rgb)
+    assert torch.equal(render_scene(again, view.camera, frames).rgb, render_scene(mended, view.camera, frames).rgb)

@@ -10,7 +10,8 @@ from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.motion.model.bases import identity_level
 from lerobot_msdyn.reconstruction.background import background_gaussians, pixel_gaussians
 from lerobot_msdyn.reconstruction.prune import without_disproved
-from lerobot_msdyn.scene.gaussians import DynamicScene, rgb_to_sh
+from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.gaussians import rgb_to_sh
 from lerobot_msdyn.scene.shading import no_shading
 
 WIDTH, HEIGHT, FRAMES = 32, 24, 6

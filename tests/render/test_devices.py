@@ -21,8 +21,8 @@ from lerobot_msdyn.reconstruction.fit import FitResult, fit
 from lerobot_msdyn.reconstruction.make_overlay import unexplained
 from lerobot_msdyn.reconstruction.result import FittedWindow, Reconstruction
 from lerobot_msdyn.reconstruction.self_check import self_check
-from lerobot_msdyn.scene import draw as rendering
-from lerobot_msdyn.scene.gaussians import DynamicScene
+from lerobot_msdyn.scene import rendering
+from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.views.gate import judge
 from lerobot_msdyn.views.pictures import coverages, new_pictures, on_device
 

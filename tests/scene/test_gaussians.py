@@ -11,17 +11,10 @@ from lerobot_msdyn.core.errors import MsdynError
 from lerobot_msdyn.core.geometry import axis_angle_to_matrix, se3
 from lerobot_msdyn.motion.field import DeformationField, fit_field
 from lerobot_msdyn.motion.model.bases import MotionLevel, level_from_motions
-from lerobot_msdyn.scene.gaussians import (
-    DynamicScene,
-    Gaussians,
-    concatenate,
-    gaussians_from_points,
-    isotropic,
-    load_scene,
-    save_scene,
-    with_slope,
-)
+from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.gaussians import Gaussians, concatenate, gaussians_from_points, isotropic, with_slope
 from lerobot_msdyn.scene.shading import encode_gain, no_shading
+from lerobot_msdyn.scene.store import load_scene, save_scene
 
 
 def some_gaussians(count: int, seed: int = 0) -> Gaussians:

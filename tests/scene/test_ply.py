@@ -9,7 +9,8 @@ import torch
 from lerobot_msdyn.core.errors import MsdynError
 from lerobot_msdyn.core.geometry import axis_angle_to_matrix, matrix_to_quaternion
 from lerobot_msdyn.scene import store as saved
-from lerobot_msdyn.scene.gaussians import Gaussians, gaussians_from_points, patched, shaded, with_slope
+from lerobot_msdyn.scene.dynamic import patched
+from lerobot_msdyn.scene.gaussians import Gaussians, gaussians_from_points, shaded, with_slope
 from lerobot_msdyn.scene.ply import export_frames, gaussians_at, load_ply, save_ply
 
 

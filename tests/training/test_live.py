@@ -11,8 +11,8 @@ from lerobot_msdyn.core.geometry import axis_angle_to_matrix, se3
 from lerobot_msdyn.motion.field import fit_field
 from lerobot_msdyn.motion.model.bases import level_from_motions
 from lerobot_msdyn.scene import store as saved
-from lerobot_msdyn.scene.draw import draw
-from lerobot_msdyn.scene.gaussians import DynamicScene
+from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.rendering import render_scene
 from lerobot_msdyn.scene.store import SavedScene
 from lerobot_msdyn.training.live import LiveScene, filled
 from lerobot_msdyn.views.perturbation import orbit_offset
@@ -69,7 +69,9 @@ def test_the_same_picture_as_the_renderer_draws(scene: SavedScene, change: objec
     for i, frame in enumerate(frames.tolist()):
         number = int(frame >= 6)
         with torch.no_grad():
-            expected = draw(scene.windows[number], camera.select([i]), torch.tensor([frame - scene.starts[number]]))
+            expected = render_scene(
+                scene.windows[number], camera.select([i]), torch.tensor([frame - scene.starts[number]])
+            )
         known = expected.alpha[0].numpy() >= 0.5
         rgb = 255 * expected.rgb[0].clamp(0, 1).permute(2, 0, 1).numpy()
         assert np.abs(found.rgb[i].astype(float) - rgb)[:, known].max() < 1

@@ -10,8 +10,8 @@ from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.reconstruction.background import EmptyScene, background_gaussians
 from lerobot_msdyn.reconstruction.evidence import Evidence, evidence_of
 from lerobot_msdyn.reconstruction.reconstruct import reconstruct
-from lerobot_msdyn.scene.draw import draw
-from lerobot_msdyn.scene.gaussians import DynamicScene
+from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.rendering import render_scene
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.nvs import covisibility
 from lerobot_msdyn.synthetic.viewpoints import heldout_cameras
@@ -39,7 +39,7 @@ def covered(offset: torch.Tensor) -> Coverage:
     scene, evidence, camera = wall()
     times = torch.tensor([1])
     moved = CameraTrack(camera.intrinsics[:1], offset[None], WIDTH, HEIGHT)
-    rendering = draw(scene, moved, times, extra=evidence.moving_frames)
+    rendering = render_scene(scene, moved, times, extra=evidence.moving_frames)
     return coverage_of(rendering, moved, times, evidence)[0]
 
 

@@ -10,7 +10,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.core.geometry import transform_points, unproject
+from lerobot_msdyn.core.geometry import nearest_pixel, transform_points, unproject
 from lerobot_msdyn.core.observations import PointTracks
 
 _EDGE_JUMP = 0.05  # relative difference of neighbouring depths that makes an edge
@@ -43,8 +43,7 @@ def lift_tracks(
     if n == 0:
         return torch.zeros(0, frames, 3), torch.zeros(0, frames, dtype=torch.bool)
     edges = torch.from_numpy(np.stack([near_depth_edge(d) for d in depth.cpu().numpy()]))
-    column = tracks.xy[..., 0].long().clamp(0, depth.shape[2] - 1)
-    row = tracks.xy[..., 1].long().clamp(0, depth.shape[1] - 1)
+    row, column = nearest_pixel(tracks.xy, depth.shape[2], depth.shape[1])
     time = torch.arange(frames).expand(n, -1)
     z = depth.cpu()[time, row, column]
     valid = tracks.visible & (z > 0) & ~edges[time, row, column]

@@ -4,18 +4,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.core.geometry import project, transform_points
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.render import Raster, rasterize
 from lerobot_msdyn.render.cpu.threads import torch_on_one_thread
-from lerobot_msdyn.scene.gaussians import DynamicScene, Snapshot, patched
+from lerobot_msdyn.scene.dynamic import DynamicScene, Snapshot, patched
 from lerobot_msdyn.scene.overlay import FramePatch
-
-BEHIND = 0.01  # share of a surface's depth by which a point may lie behind it and still be what is seen
 
 
 @dataclass(frozen=True)
@@ -29,7 +26,7 @@ class Rendering:
     extra: Float[Tensor, "t h w"] | None = None  # values of the moving Gaussians, blended like colours
 
 
-def draw(
+def render_scene(
     scene: DynamicScene,
     camera: CameraTrack,
     frames: Tensor,
@@ -38,22 +35,22 @@ def draw(
 ) -> Rendering:
     """The scene at `frames` (int, [b]) through the b poses of `camera`; differentiable.
 
-    `extra` is a value per moving Gaussian to be drawn as well; overlays have one of 1. It is drawn on the scene's
+    `extra` is a value per moving Gaussian to be rendered as well; overlays have one of 1. Runs on the scene's
     device; frames and camera may be on the host.
     """
     if scene.overlay is None:
         camera, frames = to_device((camera, frames), scene.device)
         return _rasterized(_snapshot(scene, camera, frames, extra), camera, scene.near, backend)
     own = len(scene.static) + len(scene.moving)
-    drawn = [
-        draw_patched(scene, camera.select([i]), frame, scene.overlay.patch(frame, own), backend, extra)
+    parts = [
+        render_patched(scene, camera.select([i]), frame, scene.overlay.patch(frame, own), backend, extra)
         for i, frame in enumerate(frames.tolist())
     ]
-    names = [item.name for item in fields(Rendering) if getattr(drawn[0], item.name) is not None]
-    return Rendering(**{name: torch.cat([getattr(one, name) for one in drawn]) for name in names})
+    names = [item.name for item in fields(Rendering) if getattr(parts[0], item.name) is not None]
+    return Rendering(**{name: torch.cat([getattr(one, name) for one in parts]) for name in names})
 
 
-def draw_patched(
+def render_patched(
     scene: DynamicScene,
     camera: CameraTrack,
     frame: int,
@@ -92,22 +89,6 @@ def _rasterized(snapshot: Snapshot, camera: CameraTrack, near: float, backend: s
     return Rendering(rgb, raster.depth, raster.alpha, moving[..., 0], more[0][..., 0] if more else None)
 
 
-def landed(
-    points: Float[Tensor, "n 3"], camera: CameraTrack, depth: Float[Tensor, "h w"]
-) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"], Bool[Tensor, " n"]]:
-    """Row and column of the pixel of every point (m, world) in a camera of one pose, and whether that pixel shows it.
-
-    It does if the point is inside of the picture, whose drawn depth is `depth` (m), and not behind what is drawn there.
-    What is outside is given the nearest pixel of the border.
-    """
-    height, width = depth.shape
-    xy, z = project(transform_points(camera.camera_from_world[0], points), camera.intrinsics[0])
-    column, row = xy.floor().long().unbind(-1)
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (z > 0)
-    column, row = column.clamp(0, width - 1), row.clamp(0, height - 1)
-    return row, column, inside & (z < (1 + BEHIND) * depth[row, column])
-
-
 @torch.no_grad()
 def render_frames(
     scene: DynamicScene,
@@ -123,5 +104,5 @@ def render_frames(
     for start in range(0, len(frames), batch):
         part = slice(start, min(start + batch, len(frames)))
         with torch_on_one_thread():
-            drawn = draw(scene, camera.select(part), frames[part], backend, extra)
-        yield drawn
+            rendered = render_scene(scene, camera.select(part), frames[part], backend, extra)
+        yield rendered
