@@ -10,11 +10,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from lerobot_msdyn.views.perturbation import orbit_offset
 
 from lerobot_msdyn import load_recipe, open_source, read_episode, reconstruct, render_frames
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.dataset import write_dataset
-from lerobot_msdyn.views.perturbation import orbit_offset
 
 CAMERA = "observation.images.front"
 

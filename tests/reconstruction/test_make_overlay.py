@@ -14,7 +14,7 @@ from lerobot_msdyn.reconstruction.background import background_gaussians, pixel_
 from lerobot_msdyn.reconstruction.make_overlay import unexplained
 from lerobot_msdyn.scene.draw import draw
 from lerobot_msdyn.scene.gaussians import DynamicScene, load_scene, save_scene
-from lerobot_msdyn.views.perturbation import orbit_offset
+from lerobot_msdyn.views.offsets import orbit_offset
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 4
 NEAR, FAR = 0.8, 1.0  # m
