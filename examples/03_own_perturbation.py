@@ -14,7 +14,7 @@ import torch
 from lerobot_msdyn import load_recipe, open_source, read_episode, reconstruct, render_frames
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.dataset import write_dataset
-from lerobot_msdyn.views.perturbation import orbit_offset
+from lerobot_msdyn.views.offsets import orbit_offset
 
 CAMERA = "observation.images.front"
 

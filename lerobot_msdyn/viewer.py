@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 COMMAND = "python -m lerobot_msdyn.viewer"
+ALIASES = {"repo": "repo_id"}
+FRUSTUM_SHARE = 0.15  # length of a frustum as a share of the look-at distance
+GOLDEN = 0.618034  # of the circle of hues, from one index to the next
 
 
 @dataclass
@@ -42,11 +45,6 @@ class ViewerConfig(Recipe):
     scenes: Path | None = None
     # A .rrd file to write instead of opening a window.
     save: Path | None = None
-
-
-ALIASES = {"repo": "repo_id"}
-FRUSTUM_SHARE = 0.15  # length of a drawn frustum, of the look-at distance
-GOLDEN = 0.618034  # of the circle of hues, from one index to the next
 
 
 def run(arguments: list[str]) -> int:
@@ -78,18 +76,21 @@ def show_episode(config: ViewerConfig, stream: "rr.RecordingStream") -> None:
     """Log one episode, camera by camera.
 
     Raises:
+        ConfigError: the perturbation needs what is not kept with scenes.
         DatasetError: there is no such dataset or episode, or the scenes hold none of it.
     """
     from lerobot_msdyn.dataset.read import open_source, read_episode, select_cameras, select_episodes
     from lerobot_msdyn.priors import estimate_priors
-    from lerobot_msdyn.scene import store as saved
+    from lerobot_msdyn.scene import store
+    from lerobot_msdyn.views.camera_change import check_pose
 
+    check_pose(config.perturbation)
     source = open_source(config.repo_id, config.root)
     (index,) = select_episodes(source, [config.episode])
     cameras = select_cameras(source, config.cameras)
-    known = None if config.scenes is None else saved.list_scenes(config.scenes).get(index, {})
-    if known is not None:
-        cameras = [key for key in cameras if key in known]
+    saved = None if config.scenes is None else store.list_scenes(config.scenes).get(index, {})
+    if saved is not None:
+        cameras = [key for key in cameras if key in saved]
         if not cameras:
             raise DatasetError(f"{config.scenes}: no saved scene of episode {index} of {source.repo_id}")
     episode = read_episode(source, index, cameras, config.camera, recorded_depth=config.priors.depth != "plane")
@@ -99,7 +100,7 @@ def show_episode(config: ViewerConfig, stream: "rr.RecordingStream") -> None:
         priors = estimate_priors(
             small[key], config.priors, config.camera, others=others, episode=index, key=key, device=config.device
         )
-        scene = _reconstructed(config, source, index, key, episode.views) if known is None else saved.load(known[key])
+        scene = _reconstructed(config, source, index, key, episode.views) if saved is None else store.load(saved[key])
         log = _Log(stream, key.rsplit(".", 1)[-1], episode.fps)
         _log_source(log, view, priors)
         _log_gaussians(log, scene)
@@ -116,8 +117,8 @@ def _reconstructed(config: ViewerConfig, source: Any, index: int, key: str, view
 
     others = [other for name, other in views.items() if name != key]
     logger.info("fitting %s; saved scenes are shown at once (--scenes)", key)
-    found = reconstruct(views[key], config, others=others, episode=index, key=key)
-    return found.saved(SceneSource(source.repo_id, index, key, source.fps))
+    reconstruction = reconstruct(views[key], config, others=others, episode=index, key=key)
+    return reconstruction.saved(SceneSource(source.repo_id, index, key, source.fps))
 
 
 class _Log:
@@ -136,7 +137,7 @@ class _Log:
 
 
 def _log_source(log: _Log, view: "View", priors: "Priors") -> None:
-    """The video and what was known about it before the fit."""
+    """The video and its priors."""
     import rerun as rr
 
     tracks = priors.tracks
@@ -145,10 +146,10 @@ def _log_source(log: _Log, view: "View", priors: "Priors") -> None:
         log.at(frame, "source/video", rr.Image(view.rgb[frame].numpy()).compress(jpeg_quality=90))
         log.at(frame, "priors/instances/masks", rr.SegmentationImage(priors.instances[frame].numpy()))
         log.at(frame, "priors/depth", rr.DepthImage(priors.depth[frame].numpy(), meter=1.0))
-        seen = tracks.visible[:, frame].numpy()
+        visible = tracks.visible[:, frame].numpy()
         log.at(
             frame, "priors/instances/tracks",
-            rr.Points2D(tracks.xy[:, frame].numpy()[seen], colors=colours[seen], radii=1.0),
+            rr.Points2D(tracks.xy[:, frame].numpy()[visible], colors=colours[visible], radii=1.0),
         )  # fmt: skip
 
 
@@ -159,14 +160,14 @@ def _log_gaussians(log: _Log, scene: "SavedScene") -> None:
     from lerobot_msdyn.scene.ply import gaussians_at
 
     for start, window in zip(scene.starts, scene.windows, strict=True):
-        static, still = window.static, len(window.static)
+        static, count = window.static, len(window.static)
         log.at(start, "world/static", _points(static.means, static.rgb, static.scales))
         by_level = {
             f"level_{number}": _colours(index.gather(1, logit.argmax(1, keepdim=True))[:, 0].numpy())
             for number, (index, logit) in enumerate(zip(window.indices, window.logits, strict=True))
         }
         for frame in range(window.frames):
-            moving = gaussians_at(replace(window, overlay=None), frame).select(slice(still, None))
+            moving = gaussians_at(replace(window, overlay=None), frame).select(slice(count, None))
             log.at(start + frame, "world/moving/points", _points(moving.means, moving.rgb, moving.scales))
             log.at(
                 start + frame, "world/moving/ellipsoids",
@@ -179,7 +180,7 @@ def _log_gaussians(log: _Log, scene: "SavedScene") -> None:
                 ),
             )  # fmt: skip
             if window.overlay is not None:
-                patch = window.overlay.patch(frame, still + len(moving))
+                patch = window.overlay.patch(frame, count + len(moving))
                 log.at(start + frame, "world/overlay", _points(patch.means, patch.rgb, patch.log_scales.exp()))
             for name, colours in by_level.items():
                 log.at(start + frame, f"world/motion/{name}", rr.Points3D(moving.means.numpy(), colors=colours))
@@ -211,22 +212,20 @@ def _log_camera(log: _Log, name: str, camera: "CameraTrack", distance: float) ->
 
 
 def _log_new_view(log: _Log, config: ViewerConfig, scene: "SavedScene", variant: int) -> None:
-    """One new camera as drawn by the recipe (before any bound), its pictures, and how opaque they are."""
+    """One new camera as the recipe samples it (before any bound), its pictures, and how opaque they are."""
     import rerun as rr
     import torch
 
     from lerobot_msdyn.training.live import LiveScene
-    from lerobot_msdyn.views.perturbation import Viewpoint, amounts_of, draw, moved
+    from lerobot_msdyn.views.camera_change import sample_change
 
-    key, view = scene.source.camera, Viewpoint(scene.camera, scene.distance, scene.metric)
-    share = draw(config.perturbation, config.seed, scene.source.episode, variant, len(scene))
-    amounts = amounts_of(config.perturbation, share, view, variant)
-    camera = moved(config.perturbation, {key: view}, {key: amounts})[key]
+    source = scene.source
+    change = sample_change(config.perturbation, {source.camera: scene}, config.seed, source.episode, variant)
+    camera = change.cameras()[source.camera]
     _log_camera(log, f"new_{variant}", camera, scene.distance)
     live = LiveScene(scene)
     for frame in range(len(scene)):
-        at = torch.tensor([frame])
-        pictures = live.draw(camera.select([frame]), at)
+        pictures = live.render(camera.select([frame]), torch.tensor([frame]))
         log.at(frame, f"new_{variant}/rendered", rr.Image(pictures.rgb[0].transpose(1, 2, 0)).compress(jpeg_quality=90))
         log.at(frame, f"new_{variant}/coverage", rr.Image((255 * pictures.alpha[0]).round().astype(np.uint8)))
 

@@ -103,7 +103,7 @@ def augment(
     from lerobot_msdyn.augment.run_identity import describe_run, recipe_text, source_files
     from lerobot_msdyn.dataset.provenance import SOURCE_VARIANT
     from lerobot_msdyn.dataset.write import OutputDataset
-    from lerobot_msdyn.views.perturbation import units_of_shifts
+    from lerobot_msdyn.views.camera_change import units_of_shifts
 
     start = time.perf_counter()
     if not config.convert:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lerobot_msdyn.augment.backgrounds import Backgrounds
 from lerobot_msdyn.core.cameras import read_calibration
-from lerobot_msdyn.core.config import OtherCameraConfig, Recipe
+from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.dataset.provenance import SOURCE_VARIANT, Provenance, camera_pose
@@ -141,7 +141,7 @@ def _staged(
         index,
         variant,
         recipe.seed,
-        found.drawn,
+        found.amounts,
         {key: scene.provenance for key, scene in scenes.items()},
         {key: camera_pose(scene.camera, found.cameras[key]) for key, scene in scenes.items()},
         gate,
@@ -158,17 +158,17 @@ def _staged(
 
 
 def _other_pose(recipe: Recipe, index: int, view: View) -> Tensor | None:
-    """World from the camera that `other_camera` names."""
-    config = recipe.perturbation
-    if not isinstance(config, OtherCameraConfig):
+    """World from the other camera whose pose the perturbation needs, if it needs one."""
+    name = recipe.perturbation.needs_pose_of
+    if name is None:
         return None
     camera = None
     if recipe.camera.calibration is not None:
         height, width = view.rgb.shape[1:3]
-        camera = read_calibration(recipe.camera.calibration, config.camera, index, 1, width, height)
+        camera = read_calibration(recipe.camera.calibration, name, index, 1, width, height)
     if camera is None:
         raise ConfigError(
-            f"perturbation.camera is {config.camera!r}, which the calibration {recipe.camera.calibration} does not "
+            f"perturbation.camera is {name!r}, which the calibration {recipe.camera.calibration} does not "
             "name; expected a camera with K, R and t there (--camera.calibration FILE)"
         )
     return camera.world_from_camera[0]

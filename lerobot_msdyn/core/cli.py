@@ -1,5 +1,6 @@
 """Command lines: recipe file + dotted flags -> a config, and errors -> one line and exit code 2."""
 
+import contextlib
 import dataclasses
 import difflib
 import inspect
@@ -82,6 +83,10 @@ def parse_config[T](config_class: type[T], arguments: list[str], aliases: Mappin
         ConfigError: unknown fields (all of them named at once), wrong types or values out of range.
     """
     if "-h" in arguments or "--help" in arguments:
+        plugins = []
+        with contextlib.suppress(ConfigError):  # help is also for those whose flags are wrong
+            plugins = _split_flags([item for item in arguments if item not in ("-h", "--help")], aliases)[1]
+        import_plugins(plugins)
         sys.stdout.write(format_help(config_class, aliases, command))
         sys.exit(EXIT_OK)
     recipe, plugins, overrides = _split_flags(arguments, aliases)

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-import draccus
-
 from lerobot_msdyn.core.fields import INFINITY, between, numbers_of, one_of
+from lerobot_msdyn.core.perturbation import Perturbation
 from lerobot_msdyn.core.registries import LOSSES
 
 # Named: draccus finds the comment above a field only where its annotation holds no quotes.
@@ -174,144 +173,6 @@ class FitConfig:
 
 
 @dataclass
-class PerturbationConfig(draccus.ChoiceRegistry):
-    """How the camera of a new episode differs from the recorded one (docs/perturbations.md)."""
-
-    # Whether every frame has a draw of its own, for policies that see single frames; else one per new episode.
-    per_frame: bool = False
-
-    def problems(self) -> list[str]:
-        """What is wrong between fields."""
-        return []
-
-
-@PerturbationConfig.register_subclass("orbit")
-@dataclass
-class OrbitConfig(PerturbationConfig):
-    """Turn the camera about the point it looks at, and shift it."""
-
-    # Largest turn to either side, in degrees.
-    azimuth_deg: float = between(10.0, 0, 90)
-    # Largest turn up or down, in degrees.
-    elevation_deg: float = between(5.0, 0, 60)
-    # Largest shift along each of the camera's axes in metres, where the scale is metric.
-    translation_m: float = between(0.02, 0, 10)
-    # The same as a fraction of the distance to the look-at point, where it is not.
-    translation_rel: float = between(0.03, 0, 0.9)
-
-
-@PerturbationConfig.register_subclass("translation")
-@dataclass
-class TranslationConfig(PerturbationConfig):
-    """Shift the camera without turning it."""
-
-    # Largest shift along each of the camera's axes in metres, where the scale is metric.
-    translation_m: float = between(0.04, 0, 10)
-    # The same as a fraction of the distance to the look-at point, where it is not.
-    translation_rel: float = between(0.06, 0, 0.9)
-
-
-@PerturbationConfig.register_subclass("rotation")
-@dataclass
-class RotationConfig(PerturbationConfig):
-    """Turn the camera in place."""
-
-    # Largest turn to either side, in degrees.
-    pan_deg: float = between(3.0, 0, 45)
-    # Largest turn up or down, in degrees.
-    tilt_deg: float = between(3.0, 0, 45)
-    # Largest turn about the optical axis, in degrees.
-    roll_deg: float = between(3.0, 0, 45)
-
-
-@PerturbationConfig.register_subclass("dolly")
-@dataclass
-class DollyConfig(PerturbationConfig):
-    """Move the camera along its optical axis."""
-
-    # Largest way forth or back in metres, where the scale is metric.
-    translation_m: float = between(0.06, 0, 10)
-    # The same as a fraction of the distance to the look-at point, where it is not.
-    translation_rel: float = between(0.1, 0, 0.9)
-
-
-@PerturbationConfig.register_subclass("focal")
-@dataclass
-class FocalConfig(PerturbationConfig):
-    """Change the focal length."""
-
-    # Largest change: 0.1 makes it up to 1.1 times as long or as short.
-    zoom: float = between(0.1, 0, 1)
-
-
-@PerturbationConfig.register_subclass("jitter")
-@dataclass
-class JitterConfig(PerturbationConfig):
-    """Shift and turn the camera in place, as if it had been bumped."""
-
-    # Standard deviation of the shift along each of the camera's axes in metres, where the scale is metric.
-    translation_m: float = between(0.012, 0, 10)
-    # The same as a fraction of the look-at distance, where it is not.
-    translation_rel: float = between(0.02, 0, 0.9)
-    # Standard deviation of the turn about each of the camera's axes, in degrees.
-    rotation_deg: float = between(1.0, 0, 45)
-
-
-@PerturbationConfig.register_subclass("drift")
-@dataclass
-class DriftConfig(PerturbationConfig):
-    """Move the camera smoothly along the episode, about the point it looks at."""
-
-    # Largest turn to either side, in degrees.
-    azimuth_deg: float = between(6.0, 0, 90)
-    # Largest turn up or down, in degrees.
-    elevation_deg: float = between(3.0, 0, 60)
-    # Largest shift along each of the camera's axes in metres, where the scale is metric.
-    translation_m: float = between(0.02, 0, 10)
-    # The same as a fraction of the distance to the look-at point, where it is not.
-    translation_rel: float = between(0.03, 0, 0.9)
-    # How often it goes back and forth in an episode.
-    cycles: float = between(0.5, 0, 100)
-
-    def problems(self) -> list[str]:
-        """What is wrong between fields."""
-        return _no_draw_per_frame(self)
-
-
-@PerturbationConfig.register_subclass("poses")
-@dataclass
-class PosesConfig(PerturbationConfig):
-    """Given poses, one after the other over the variants."""
-
-    # Each the first three rows of (new camera from recorded camera), 12 numbers row by row; metres.
-    poses: list[list[float]] = field(default_factory=list)
-
-    def problems(self) -> list[str]:
-        """What is wrong between fields."""
-        none = [] if self.poses else ["poses is empty; expected at least one pose of 12 numbers"]
-        bad = [
-            f"poses[{number}] is no rigid motion; expected 12 numbers, three rows of a rotation and a shift in metres"
-            for number, pose in enumerate(self.poses)
-            if not _is_rigid(pose)
-        ]
-        return [*none, *bad, *_no_draw_per_frame(self)]
-
-
-@PerturbationConfig.register_subclass("other_camera")
-@dataclass
-class OtherCameraConfig(PerturbationConfig):
-    """Look from where another calibrated camera stands."""
-
-    # Its name in the calibration file.
-    camera: str = ""
-
-    def problems(self) -> list[str]:
-        """What is wrong between fields."""
-        unnamed = [] if self.camera else ["camera is empty; expected the name of a camera in the calibration file"]
-        return unnamed + _no_draw_per_frame(self)
-
-
-@dataclass
 class GateConfig:
     """Which new views are kept: each is judged without ground truth, at a few frames (docs/quality.md)."""
 
@@ -354,7 +215,7 @@ class Recipe:
     scene: SceneConfig = field(default_factory=SceneConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
     fit: FitConfig = field(default_factory=FitConfig)
-    perturbation: PerturbationConfig = field(default_factory=OrbitConfig)
+    perturbation: Perturbation = field(default_factory=lambda: Perturbation.get_choice_class("orbit")())
     # Largest share of a new view that no frame has shown, 0..1; a change that shows more is shrunk, or rejected.
     max_unseen: float = between(0.2, 0, 1)
     # What stands where nothing was seen: inpaint (continued from what is behind), nearest, or none (black).
@@ -372,24 +233,6 @@ class Recipe:
         """Whether a prior is for a whole video: exchange files, and the poses of a moving camera."""
         sources = (self.priors.depth, self.priors.masks, self.priors.tracks, self.camera.poses)
         return self.camera.poses == "sfm" or any(source.endswith(".npz") for source in sources)
-
-
-def _is_rigid(pose: list[float]) -> bool:
-    """Whether 12 numbers, row by row, are a rotation and a shift."""
-    if len(pose) != 12:
-        return False
-    x, y, z = pose[0:3], pose[4:7], pose[8:11]
-    products = [sum(p * q for p, q in zip(a, b, strict=True)) for a in (x, y, z) for b in (x, y, z)]
-    identity = [1, 0, 0, 0, 1, 0, 0, 0, 1]
-    crossed = (x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0])
-    right_handed = sum(p * q for p, q in zip(crossed, z, strict=True)) > 0
-    return right_handed and all(abs(p - q) < 1e-3 for p, q in zip(products, identity, strict=True))
-
-
-def _no_draw_per_frame(config: PerturbationConfig) -> list[str]:
-    if not config.per_frame:
-        return []
-    return ["per_frame is true; expected false for this type, which draws nothing per frame"]
 
 
 def _is_hierarchy(levels: list[LevelName]) -> bool:

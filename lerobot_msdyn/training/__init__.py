@@ -1,4 +1,4 @@
-"""Views of saved scenes, drawn while a policy is trained (docs/training.md)."""
+"""Views of saved scenes, rendered while a policy is trained (docs/training.md)."""
 
 from lerobot_msdyn.training.mixed import MixedViews
 from lerobot_msdyn.training.streamed import MixedStream

@@ -14,7 +14,7 @@ class MixedViewsConfig:
     scenes: Path = Path()
     # Share of the samples that are seen from elsewhere.
     probability: float = between(0.5, 0, 1)
-    # A recipe, by file or name, whose perturbation is drawn; default: the one of the run that saved the scenes.
+    # A recipe, by file or name, whose perturbation is used; default: the one of the run that saved the scenes.
     perturbation: str | None = None
     # Seed of every random choice; together with the epoch and the sample's index it fixes the result.
     seed: int = between(0, 0, 4_294_967_295)

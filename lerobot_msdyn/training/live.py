@@ -2,10 +2,9 @@
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Int, UInt8
+from jaxtyping import Float32, Int, UInt8
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
@@ -16,9 +15,7 @@ from lerobot_msdyn.scene.overlay import PATCH_OPACITY, Overlay
 from lerobot_msdyn.scene.store import SavedScene
 from lerobot_msdyn.training.posing import pose
 from lerobot_msdyn.views.coverage import HOLE_ALPHA
-
-_COARSER = 4  # holes are filled at a quarter of the size
-_SMALLEST_PX = 2  # the pyramid that fills holes ends where a side is so short
+from lerobot_msdyn.views.filling import filled_softly
 
 
 @dataclass(frozen=True)
@@ -31,7 +28,7 @@ class LivePictures:
 
 
 class LiveScene:
-    """A saved scene, prepared for drawing single frames; not for several threads at once."""
+    """A saved scene, prepared for rendering single frames; not for several threads at once."""
 
     def __init__(self, scene: SavedScene) -> None:
         """Prepare every window."""
@@ -43,7 +40,7 @@ class LiveScene:
         """Memory of the scene and of what was prepared."""
         return self.scene.size_in_bytes + sum(window.size_in_bytes for window in self._windows)
 
-    def draw(self, camera: CameraTrack, frames: Int[Tensor, " t"]) -> LivePictures:
+    def render(self, camera: CameraTrack, frames: Int[Tensor, " t"]) -> LivePictures:
         """The scene at some frames through as many poses, holes filled."""
         height, width = camera.height, camera.width
         rgb = np.empty((len(frames), 3, height, width), np.uint8)
@@ -51,12 +48,13 @@ class LiveScene:
         opacity = np.empty((len(frames), height, width), np.float32)
         windows = self.scene.windows_of(frames).tolist()
         for i, (number, frame) in enumerate(zip(windows, frames.tolist(), strict=True)):
-            at = camera.select([i])
-            seen, distance, alpha = self._windows[number].draw(at, frame - self.scene.starts[number])
+            window, start = self._windows[number], self.scene.starts[number]
+            colours, distance, alpha = window.render(camera.select([i]), frame - start)
+            known = alpha >= HOLE_ALPHA
             opacity[i] = alpha
-            rgb[i] = filled(seen, alpha >= HOLE_ALPHA)
+            rgb[i] = filled_softly(colours, known)
             if self.scene.metric:
-                depth[i] = np.where(alpha >= HOLE_ALPHA, distance, np.float32(0))
+                depth[i] = np.where(known, distance, np.float32(0))
         return LivePictures(rgb, depth, opacity)
 
 
@@ -103,7 +101,7 @@ class _LiveWindow:
         return sum(array.nbytes for array in (*shown, *bases))
 
     @torch.no_grad()
-    def draw(self, camera: CameraTrack, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def render(self, camera: CameraTrack, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Colours uint8 [3,h,w], depth (m) [h,w] and opacity [h,w] of one frame through a camera of one pose."""
         time = torch.tensor([frame])
         eye = camera.world_from_camera[0, :3, 3]
@@ -171,33 +169,3 @@ class _LiveWindow:
 def _is_idle(level: object) -> bool:
     """Whether a level moves nothing."""
     return isinstance(level, MotionLevel) and not bool(level.active.any())
-
-
-def filled(rgb: UInt8[np.ndarray, "3 h w"], known: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "3 h w"]:
-    """A picture whose holes show what is around them, ever more coarsely (pull-push, Gortler et al. 1996).
-
-    Softer than the inpainting of written episodes, and several times as fast.
-    """
-    if known.all() or not known.any():
-        return rgb
-    mask = known.astype(np.uint8)
-    height, width = known.shape
-    coarse = (max(width // _COARSER, 1), max(height // _COARSER, 1))
-    weighted = [cv2.resize(plane, coarse, interpolation=cv2.INTER_AREA) for plane in (rgb * mask).astype(np.float32)]
-    weight = cv2.resize(mask.astype(np.float32), coarse, interpolation=cv2.INTER_AREA)
-    pulled = _pulled(np.stack(weighted, axis=-1), weight).clip(0, 255).round().astype(np.uint8)
-    around = [cv2.resize(plane, (width, height), interpolation=cv2.INTER_LINEAR) for plane in pulled.transpose(2, 0, 1)]
-    return np.stack([cv2.copyTo(plane, mask, hidden) for plane, hidden in zip(rgb, around, strict=True)])
-
-
-def _pulled(weighted: Float32[np.ndarray, "h w 3"], weight: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w 3"]:
-    """Colours everywhere from colours times weights: where weights are missing, those of the next coarser image."""
-    here = weighted / np.maximum(weight, 1e-6)[..., None]
-    height, width = weight.shape
-    if min(height, width) <= _SMALLEST_PX:
-        mean = weighted.sum((0, 1)) / max(float(weight.sum()), 1e-6)
-        return np.where(weight[..., None] > 0, here, mean).astype(np.float32)
-    coarser = _pulled(cv2.pyrDown(weighted), cv2.pyrDown(weight))
-    below = cv2.resize(coarser, (width, height), interpolation=cv2.INTER_LINEAR)
-    share = np.minimum(weight, 1)[..., None]
-    return np.asarray(below + share * (here - below), np.float32)

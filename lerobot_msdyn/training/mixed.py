@@ -8,14 +8,14 @@ import numpy as np
 import torch
 from lerobot.datasets import LeRobotDataset
 
-from lerobot_msdyn.core.config import PerturbationConfig
+from lerobot_msdyn.core.perturbation import Perturbation
 from lerobot_msdyn.training.config import MixedViewsConfig
 from lerobot_msdyn.training.mixer import ViewMixer, colour_sample, depth_sample
 from lerobot_msdyn.training.scene_cache import Scenes
 
 
 class MixedViews(torch.utils.data.Dataset):
-    """Wraps a LeRobotDataset; with some probability a sample's cameras are drawn from the episode's saved scene.
+    """Wraps a LeRobotDataset; with some probability a sample's pictures are rendered from the episode's saved scene.
 
     One new pose per camera holds for the whole observation window; cameras without a scene, states, actions and all
     else are as recorded. What a sample is depends on (seed, epoch, index) alone, not on workers or order. Everything
@@ -27,12 +27,12 @@ class MixedViews(torch.utils.data.Dataset):
         dataset: LeRobotDataset,
         scenes: str | os.PathLike[str] | Scenes,
         probability: float = MixedViewsConfig.probability,
-        perturbation: PerturbationConfig | None = None,
+        perturbation: Perturbation | None = None,
         seed: int = MixedViewsConfig.seed,
         *,
         memory_mb: float = MixedViewsConfig.memory_mb,
     ) -> None:
-        """Nothing is drawn or loaded yet.
+        """Nothing is rendered or loaded yet.
 
         Args:
             dataset: the dataset from which the scenes were made, or the output of that run.
@@ -43,7 +43,7 @@ class MixedViews(torch.utils.data.Dataset):
             memory_mb: bound for the scenes that are kept loaded, in each process.
 
         Raises:
-            ConfigError: a value is out of range.
+            ConfigError: a value is out of range, or the perturbation is not known here.
             MsdynError: there are no scenes, or they are of other videos.
         """
         self.dataset = dataset
@@ -68,7 +68,7 @@ class MixedViews(torch.utils.data.Dataset):
         return len(self.dataset)
 
     def set_epoch(self, epoch: int) -> None:
-        """Tell it, and workers that run already, which epoch it is; from then on other samples are drawn anew."""
+        """Tell it, and workers that run already, which epoch it is; from then on samples are seen from elsewhere."""
         self.mixer.set_epoch(epoch)
 
     def __getitem__(self, index: int | slice) -> dict[str, Any] | list[dict[str, Any]]:
@@ -83,7 +83,7 @@ class MixedViews(torch.utils.data.Dataset):
         cameras = self.mixer.replaced(episode, absolute)
         if not cameras:
             return dict(self.dataset[index])
-        pictures = self.mixer.draw(episode, absolute - int(self._starts[episode]), absolute, cameras)
+        pictures = self.mixer.render(episode, absolute - int(self._starts[episode]), absolute, cameras)
         return with_pictures(self.dataset, index, pictures, self.mixer)
 
 
@@ -93,13 +93,13 @@ def with_pictures(
     """A dataset's sample with other pictures in it, transformed as the dataset's own are."""
     meta = dataset.meta
     item = _read(dataset, index, pictures.keys() & set(meta.video_keys))
-    for key, found in pictures.items():
+    for key, picture in pictures.items():
         windowed = _is_windowed(dataset, key, mixer)
         if key in meta.depth_keys:
-            item[key] = depth_sample(found, meta, key, dataset.depth_output_unit, windowed=windowed)
+            item[key] = depth_sample(picture, meta, key, dataset.depth_output_unit, windowed=windowed)
         else:
             as_bytes = key in meta.video_keys and dataset._return_uint8
-            item[key] = colour_sample(found, torch.uint8 if as_bytes else torch.float32, windowed=windowed)
+            item[key] = colour_sample(picture, torch.uint8 if as_bytes else torch.float32, windowed=windowed)
     if dataset.image_transforms is not None:
         for key in meta.camera_keys:
             if key not in meta.depth_keys:

@@ -1,7 +1,6 @@
-"""Decides which samples are seen from elsewhere, and draws them: a function of (seed, epoch, index) alone."""
+"""Decides which samples are seen from elsewhere, and renders them: a function of (seed, epoch, index) alone."""
 
 import os
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -12,19 +11,18 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.core.config import OtherCameraConfig, PerturbationConfig
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.core.fields import problems
+from lerobot_msdyn.core.perturbation import Perturbation
 from lerobot_msdyn.dataset.read import MILLIMETRES, depth_key_of
-from lerobot_msdyn.scene.store import SavedScene
 from lerobot_msdyn.training.config import MixedViewsConfig
 from lerobot_msdyn.training.live import LiveScene
-from lerobot_msdyn.training.matching import recipe_of, scenes_of
+from lerobot_msdyn.training.matching import scenes_of, settings_of
 from lerobot_msdyn.training.scene_cache import SceneCache, Scenes
+from lerobot_msdyn.views.camera_change import check_pose, sample_change
 from lerobot_msdyn.views.coverage import HOLE_ALPHA
-from lerobot_msdyn.views.perturbation import Viewpoint, amounts_of, draw, moved
 
-FACTORS = (1.0, 0.5, 0.25)  # of a change that was drawn, until little enough of the picture is empty
+FACTORS = (1.0, 0.5, 0.25)  # of a change, until little enough of the picture is empty
 
 
 class ViewMixer:
@@ -37,29 +35,24 @@ class ViewMixer:
         deltas: dict[str, list[int]],
         scenes: str | os.PathLike[str] | Scenes,
         probability: float,
-        perturbation: PerturbationConfig | None,
+        perturbation: Perturbation | None,
         seed: int,
         memory_mb: float,
     ) -> None:
         """See `MixedViews`; `deltas` are the observation windows of the cameras, in frames.
 
         Raises:
-            ConfigError: a value is out of range.
+            ConfigError: a value is out of range, or the perturbation cannot be used here.
             MsdynError: there are no scenes, or they are of other videos.
         """
-        found = problems(MixedViewsConfig(probability=probability, seed=seed, memory_mb=memory_mb))
-        if found:
-            raise ConfigError("; ".join(found))
+        wrong = problems(MixedViewsConfig(probability=probability, seed=seed, memory_mb=memory_mb))
+        if wrong:
+            raise ConfigError("; ".join(wrong))
         if isinstance(scenes, str | os.PathLike):
             scenes = Path(scenes)
         self.probability, self.seed, self.deltas = probability, seed, deltas
-        recipe = recipe_of(scenes)
-        self.perturbation = recipe.perturbation if perturbation is None else perturbation
-        self.max_empty = recipe.max_unseen
-        if isinstance(self.perturbation, OtherCameraConfig):
-            raise ConfigError(
-                "perturbation is 'other_camera', whose pose is not kept with the scenes; choose another kind"
-            )
+        self.perturbation, self.max_empty = settings_of(scenes, perturbation)
+        check_pose(self.perturbation)
         self.cache = SceneCache(scenes_of(meta, episodes, scenes), memory_mb)
         self.depth_keys = {camera: depth_key_of(meta, camera) for camera in meta.camera_keys}
         self._lengths = [int(length) for length in meta.episodes["length"]]
@@ -75,16 +68,17 @@ class ViewMixer:
         self._epoch[0] = epoch
 
     def replaced(self, episode: int, index: int) -> list[str]:
-        """The cameras of a sample that are to be drawn in this epoch; none, if it stays as recorded."""
+        """The cameras of a sample that are to be rendered in this epoch; none, if it stays as recorded."""
         if np.random.default_rng([self.seed, self.epoch, index]).random() >= self.probability:
             return []
         return sorted(self.cache.scenes.get(episode, ()))
 
-    def draw(self, episode: int, position: int, index: int, cameras: list[str]) -> dict[str, np.ndarray]:
+    def render(self, episode: int, position: int, index: int, cameras: list[str]) -> dict[str, np.ndarray]:
         """The windows of some cameras and of their depth (if recorded), by feature; each through one new pose.
 
-        A pose from which more than `max_empty` of a picture shows nothing is brought half as far, and again.
-        Colours are uint8 [t,3,h,w], depth float32 [t,h,w] in m.
+        The epochs of a sample are stratified as the variants of an episode are. Of changes that differ from frame to
+        frame the one at the sample's own is taken. A pose from which more than `max_empty` of a picture shows nothing
+        is brought half as far, and again. Colours are uint8 [t,3,h,w], depth float32 [t,h,w] in m.
 
         Args:
             episode: of the dataset.
@@ -93,21 +87,14 @@ class ViewMixer:
             cameras: from `replaced`.
         """
         live = {camera: self.cache.get(episode, camera) for camera in cameras}
+        scenes = {camera: one.scene for camera, one in live.items()}
+        change = sample_change(self.perturbation, scenes, self.seed, index, self.epoch).at(position)
         for factor in FACTORS:
-            seen_from = new_cameras(
-                self.perturbation,
-                {camera: one.scene for camera, one in live.items()},
-                self.seed,
-                index,
-                self.epoch,
-                position,
-                factor,
-            )
             pictures: dict[str, np.ndarray] = {}
             emptiest = 0.0
-            for camera in cameras:
-                found, empty = self._windows(live[camera], seen_from[camera], camera, position, episode)
-                pictures |= found
+            for camera, seen_from in change.cameras(factor).items():
+                windows, empty = self._windows(live[camera], seen_from, camera, position, episode)
+                pictures |= windows
                 emptiest = max(emptiest, empty)
             if emptiest <= self.max_empty:
                 break
@@ -123,35 +110,11 @@ class ViewMixer:
         within = np.clip(colour + depth, 0, self._lengths[episode] - 1)
         wanted, places = np.unique(within, return_inverse=True)
         frames = torch.from_numpy(wanted)
-        drawn = live.draw(seen_from.select(frames), frames)
-        pictures = {camera: drawn.rgb[places[: len(colour)]]}
+        rendered = live.render(seen_from.select(frames), frames)
+        pictures = {camera: rendered.rgb[places[: len(colour)]]}
         if depth_key is not None:
-            pictures[depth_key] = drawn.depth[places[len(colour) :]]
-        return pictures, float((drawn.alpha < HOLE_ALPHA).mean((1, 2)).max())
-
-
-def new_cameras(
-    config: PerturbationConfig,
-    scenes: Mapping[str, SavedScene],
-    seed: int,
-    index: int,
-    epoch: int,
-    position: int,
-    factor: float = 1.0,
-) -> dict[str, CameraTrack]:
-    """One draw for all cameras of a sample, for all frames of the episode.
-
-    The epochs of a sample are stratified as the variants of an episode are. Changes that differ from frame to frame
-    are taken as they are at the sample's own: a window has one pose. `factor` is the share of the change that is made.
-    """
-    views = {key: Viewpoint(scene.camera, scene.distance, scene.metric) for key, scene in scenes.items()}
-    if not views:
-        return {}
-    frames = min(len(scene) for scene in scenes.values())
-    share = draw(config, seed, index, epoch, frames)
-    share = share[position : position + 1] if len(share) > 1 else share
-    amounts = {key: factor * amounts_of(config, share, view, epoch) for key, view in views.items()}
-    return moved(config, views, amounts)
+            pictures[depth_key] = rendered.depth[places[len(colour) :]]
+        return pictures, float((rendered.alpha < HOLE_ALPHA).mean((1, 2)).max())
 
 
 def colour_sample(rgb: UInt8[np.ndarray, "t 3 h w"], dtype: torch.dtype, *, windowed: bool) -> Tensor:

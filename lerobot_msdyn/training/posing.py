@@ -1,7 +1,7 @@
 # mypy: disable-error-code="no-untyped-def"
 """Where the moving Gaussians are at one time and how they look from one point, in one pass and without gradients.
 
-The same as `DynamicScene.at`, about seven times as fast: training draws single frames, where torch spends its time
+The same as `DynamicScene.at`, about seven times as fast: training renders single frames, where torch spends its time
 between many small operations.
 """
 
@@ -15,7 +15,7 @@ from lerobot_msdyn.render.cpu.jit import device, kernel
 from lerobot_msdyn.render.cpu.vectors3 import add, apply_transposed, combined, cross, dot, scaled
 from lerobot_msdyn.scene.gaussians import SH_C0, SH_C1
 
-_DEGENERATE = np.float32(1e-6)  # square of the area below which a blend has no direction left (as in motion.bases)
+_DEGENERATE = np.float32(1e-6)  # square of the area below which a blend has no direction (see motion.model.bases)
 _C0, _C1 = np.float32(SH_C0), np.float32(SH_C1)
 _ZERO, _HALF, _ONE, _TINY = np.float32(0), np.float32(0.5), np.float32(1), np.float32(1e-24)
 _ZEROS = (_ZERO, _ZERO, _ZERO)

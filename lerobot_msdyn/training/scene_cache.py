@@ -13,7 +13,7 @@ Scenes = Mapping[int, Mapping[str, Path | SavedScene]]  # source episode -> came
 
 
 class SceneCache:
-    """Scenes ready to be drawn; those used longest ago are given up first. Every process has its own."""
+    """Scenes ready to be rendered; those used longest ago are given up first. Every process has its own."""
 
     def __init__(self, scenes: Scenes, memory_mb: float) -> None:
         """Nothing is loaded yet; the scene in use is kept even where it alone is above the bound."""

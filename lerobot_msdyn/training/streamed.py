@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from lerobot_msdyn.core.config import PerturbationConfig
+from lerobot_msdyn.core.perturbation import Perturbation
 from lerobot_msdyn.training.config import MixedViewsConfig
 from lerobot_msdyn.training.mixer import ViewMixer, colour_sample, depth_sample
 from lerobot_msdyn.training.scene_cache import Scenes
@@ -24,7 +24,7 @@ class MixedStream(torch.utils.data.IterableDataset):
         dataset: Any,
         scenes: str | os.PathLike[str] | Scenes,
         probability: float = MixedViewsConfig.probability,
-        perturbation: PerturbationConfig | None = None,
+        perturbation: Perturbation | None = None,
         seed: int = MixedViewsConfig.seed,
         *,
         memory_mb: float = MixedViewsConfig.memory_mb,
@@ -59,16 +59,14 @@ class MixedStream(torch.utils.data.IterableDataset):
     def _mixed(self, item: dict[str, Any]) -> dict[str, Any]:
         """A sample, seen from elsewhere if its turn has come."""
         episode, position, index = (int(item[key]) for key in ("episode_index", "frame_index", "index"))
-        pictures = self.mixer.draw(episode, position, index, self.mixer.replaced(episode, index))
-        for key, found in pictures.items():
+        pictures = self.mixer.render(episode, position, index, self.mixer.replaced(episode, index))
+        for key, picture in pictures.items():
             windowed = item[key].ndim == 4
             if key in self.dataset.meta.depth_keys:
                 unit = self.dataset.depth_output_unit
-                item[key] = depth_sample(found, self.dataset.meta, key, unit, windowed=windowed)
+                item[key] = depth_sample(picture, self.dataset.meta, key, unit, windowed=windowed)
             else:
-                image, transforms = (
-                    colour_sample(found, item[key].dtype, windowed=windowed),
-                    self.dataset.image_transforms,
-                )
+                image = colour_sample(picture, item[key].dtype, windowed=windowed)
+                transforms = self.dataset.image_transforms
                 item[key] = image if transforms is None else transforms(image)
         return item

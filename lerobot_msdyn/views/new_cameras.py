@@ -1,4 +1,4 @@
-"""New cameras of an episode: drawn, and shrunk along their own path until enough of what they show was recorded."""
+"""New cameras of an episode: sampled, and shrunk along their own path until enough of what they show was recorded."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -9,12 +9,12 @@ from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.core.config import PosesConfig, Recipe
+from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.reconstruction.evidence import is_behind
 from lerobot_msdyn.reconstruction.result import Reconstruction
-from lerobot_msdyn.views.perturbation import Viewpoint, amounts_of, described, draw, moved
+from lerobot_msdyn.views.camera_change import sample_change
 from lerobot_msdyn.views.pictures import coverages
 
 FRAMES = 4  # at which coverage is looked at
@@ -22,7 +22,7 @@ ROUNDS = 5  # of bisection
 SMALLEST = 0.1  # share of a change that is still worth rendering
 MIN_CROP = 0.5  # share of the picture's width that a crop keeps at least
 CROP_STEPS = 32
-STRAY = 0.002  # share of a crop's pixels that may be unseen all the same
+STRAY = 0.002  # share of a crop's pixels that may be empty all the same
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class NewCameras:
     """The cameras of one new episode."""
 
     cameras: dict[str, CameraTrack]  # at the size of the recorded videos
-    drawn: dict[str, dict[str, float]]  # camera -> what was drawn
+    amounts: dict[str, dict[str, float]]  # camera -> what was sampled, by name
     rejected: str = ""  # why they must not be used
 
 
@@ -42,40 +42,36 @@ def new_cameras(
     attempt: int = 0,
     other: Float[Tensor, "4 4"] | None = None,
 ) -> NewCameras:
-    """One draw for all cameras of an episode, within `recipe.max_unseen`; a function of the seed and the numbers.
+    """One sample for all cameras of an episode, within `recipe.max_unseen`; a function of the seed and the numbers.
 
-    `other` is the pose of the camera that `other_camera` names.
+    Arguments as in `sample_change`.
 
     Raises:
-        ConfigError: a given pose is behind what the recorded camera sees.
+        ConfigError: a given pose is behind what the recorded camera sees, or the pose of another camera is missing.
     """
-    views = {key: Viewpoint(scene.camera, scene.distance, scene.metric) for key, scene in scenes.items()}
-    frames = min(len(scene.camera) for scene in scenes.values())
-    share = draw(recipe.perturbation, recipe.seed, episode, variant, frames, attempt)
-    amounts = {key: amounts_of(recipe.perturbation, share, view, variant, other) for key, view in views.items()}
+    perturbation = recipe.perturbation
+    change = sample_change(perturbation, scenes, recipe.seed, episode, variant, attempt, other)
 
     def at(factor: float) -> dict[str, CameraTrack]:
-        found = moved(recipe.perturbation, views, {key: factor * value for key, value in amounts.items()})
-        return _cropped(scenes, found) if recipe.crop_to_covered else found
+        cameras = change.cameras(factor)
+        return _cropped(scenes, cameras) if recipe.crop_to_covered else cameras
 
     def worst(factor: float) -> float:
         return max(_unseen(scenes[key], camera) for key, camera in at(factor).items())
 
-    if isinstance(recipe.perturbation, PosesConfig) and any(
-        is_behind_scene(scenes[key], c) for key, c in at(1.0).items()
-    ):
+    if perturbation.refuses_behind and any(is_behind_scene(scenes[key], c) for key, c in change.cameras().items()):
         raise ConfigError(
-            f"the pose of perturbation.poses for variant {variant} is behind what the recorded camera of "
-            f"episode {episode} sees (under the table, say); expected a place in front of it"
+            f"the pose that perturbation {perturbation.type_name!r} gives for variant {variant} is behind what the "
+            f"recorded camera of episode {episode} sees (under the table, say); expected a place in front of it"
         )
     factor = largest_factor(worst, recipe.max_unseen)
-    drawn = {key: described(amounts[key], view) for key, view in views.items()}
+    amounts = change.described()
     if factor is None:
-        reason = f"more than {100 * recipe.max_unseen:g} % unseen even at {SMALLEST:g} of the change drawn"
-        return NewCameras(at(SMALLEST), drawn, reason)
+        reason = f"more than {100 * recipe.max_unseen:g} % unseen even at {SMALLEST:g} of the change that was sampled"
+        return NewCameras(at(SMALLEST), amounts, reason)
     if factor < 1:
-        drawn = {key: value | {"shrunk_to": factor} for key, value in drawn.items()}
-    return NewCameras(at(factor), drawn)
+        amounts = {key: named | {"shrunk_to": factor} for key, named in amounts.items()}
+    return NewCameras(at(factor), amounts)
 
 
 def largest_factor(unseen_at: Callable[[float], float], bound: float) -> float | None:
@@ -107,19 +103,19 @@ def _unseen(scene: Reconstruction, camera: CameraTrack) -> float:
     """The largest unseen share of some frames; 1 for a camera behind the scene."""
     if is_behind_scene(scene, camera):
         return 1.0
-    return max(found.unseen_share for found in coverages(scene, *_looked_at(scene, camera)))
+    return max(coverage.unseen_share for coverage in coverages(scene, *_looked_at(scene, camera)))
 
 
 def _cropped(scenes: Mapping[str, Reconstruction], cameras: dict[str, CameraTrack]) -> dict[str, CameraTrack]:
-    """The cameras with what was not seen at their borders cut off, by a change of their intrinsics."""
+    """The cameras without the empty parts at their borders, by a change of their intrinsics."""
     cropped = {}
     for key, camera in cameras.items():
-        masks = [found.empty for found in coverages(scenes[key], *_looked_at(scenes[key], camera))]
-        left, top, share = covered_rectangle(np.any(masks, axis=0))
+        empty = [coverage.empty for coverage in coverages(scenes[key], *_looked_at(scenes[key], camera))]
+        left, top, size = covered_rectangle(np.any(empty, axis=0))
         intrinsics = camera.intrinsics.clone()
         intrinsics[:, 0, 2] -= left * camera.width
         intrinsics[:, 1, 2] -= top * camera.height
-        intrinsics[:, :2] /= share
+        intrinsics[:, :2] /= size
         cropped[key] = replace(camera, intrinsics=intrinsics)
     return cropped
 
@@ -131,12 +127,12 @@ def covered_rectangle(empty: Bool[ndarray, "h w"]) -> tuple[float, float, float]
     """
     height, width = empty.shape
     sums = np.pad(empty.astype(np.int64).cumsum(0).cumsum(1), ((1, 0), (1, 0)))
-    for share in np.linspace(1, MIN_CROP, CROP_STEPS):
-        h, w = round(height * share), round(width * share)
+    for size in np.linspace(1, MIN_CROP, CROP_STEPS):
+        h, w = round(height * size), round(width * size)
         inside = sums[h:, w:] - sums[:-h, w:] - sums[h:, :-w] + sums[:-h, :-w]
         rows, columns = np.nonzero(inside <= STRAY * h * w)
         if len(rows):
             off = (rows - (height - h) / 2) ** 2 + (columns - (width - w) / 2) ** 2
             best = int(off.argmin())
-            return float(columns[best] / width), float(rows[best] / height), float(share)
+            return float(columns[best] / width), float(rows[best] / height), float(size)
     return 0.0, 0.0, 1.0

@@ -1,4 +1,4 @@
-"""A reconstructed camera seen from elsewhere: pictures and coverage, frame by frame."""
+"""A reconstructed camera's video from elsewhere: pictures and their coverage, frame by frame."""
 
 import logging
 from collections.abc import Iterator
@@ -27,36 +27,40 @@ class Picture:
 
     rgb: UInt8[np.ndarray, "h w 3"]
     depth: Float32[np.ndarray, "h w"]  # m, z-depth; 0 where nothing is known, and everywhere if there is no true scale
-    unseen: Bool[np.ndarray, "h w"]  # what no frame has shown, and was filled in
-
-
-def coverages(scene: Reconstruction, camera: CameraTrack, frames: Tensor | None = None) -> Iterator[Coverage]:
-    """What is known about each pixel of another camera's frames; `frames` as in `new_pictures`."""
-    for _, found, _ in _drawn(scene, camera, frames):
-        yield from found
+    unseen: Bool[np.ndarray, "h w"]  # uncovered: what no recorded frame has shown
 
 
 def new_pictures(
     scene: Reconstruction, camera: CameraTrack, frames: Tensor | None = None, *, fill: Fill = Recipe.fill
 ) -> Iterator[Picture]:
-    """The scene through another camera, holes filled; the share of what is unseen is logged at the end.
+    """The scene through another camera, holes filled; the share of what is uncovered is logged at the end.
 
-    `frames` (int, [t]) are those that the poses of `camera` belong to; default: all.
+    Args:
+        scene: the reconstructed camera.
+        camera: the other one, of any size.
+        frames: those that its poses belong to (int, [t]); default: all.
+        fill: how holes are filled.
     """
     shares: list[float] = []
-    for rendering, found, behind in _drawn(scene, camera, frames, fill):
-        drawn = (rendering.rgb + missing(rendering.alpha)[..., None] * behind).clamp(0, 1)
-        drawn, depths = to_device(((drawn * 255).round().to(torch.uint8), rendering.depth), "cpu")
-        for i, coverage in enumerate(found):
+    for rendering, of_frames, behind in _rendered(scene, camera, frames, fill):
+        composed = (rendering.rgb + missing(rendering.alpha)[..., None] * behind).clamp(0, 1)
+        rgb, depths = to_device(((composed * 255).round().to(torch.uint8), rendering.depth), "cpu")
+        for i, coverage in enumerate(of_frames):
             shares.append(coverage.unseen_share)
             known = ~coverage.empty & scene.metric
             depth = np.where(known, depths[i].numpy(), np.float32(0))
-            yield Picture(drawn[i].numpy(), depth, coverage.unseen)
-    logger.info("%.1f %% of the pixels were never seen (worst frame %.1f %%)", 100 * np.mean(shares), 100 * max(shares))
+            yield Picture(rgb[i].numpy(), depth, coverage.unseen)
+    logger.info("%.1f %% of the pixels are uncovered (worst frame %.1f %%)", 100 * np.mean(shares), 100 * max(shares))
+
+
+def coverages(scene: Reconstruction, camera: CameraTrack, frames: Tensor | None = None) -> Iterator[Coverage]:
+    """What is known about each pixel of another camera's frames; arguments as in `new_pictures`."""
+    for _, of_frames, _ in _rendered(scene, camera, frames):
+        yield from of_frames
 
 
 def on_device(scene: Reconstruction, device: torch.device) -> Reconstruction:
-    """The same with what is drawn, and what it is compared with pixel by pixel, on a device."""
+    """The same reconstruction with all that new views are rendered from and compared with on a device."""
     windows = tuple(
         replace(window, scene=to_device(window.scene, device), evidence=to_device(window.evidence, device))
         for window in scene.windows
@@ -65,14 +69,14 @@ def on_device(scene: Reconstruction, device: torch.device) -> Reconstruction:
 
 
 class UnseenMasks:
-    """Collects, as pictures pass by, which of their pixels were never seen."""
+    """Collects, as pictures pass by, masks of what is uncovered in them."""
 
     def __init__(self) -> None:
         self._packed: dict[str, list[np.ndarray]] = {}
         self._width: dict[str, int] = {}
 
     def kept(self, key: str, pictures: Iterator[Picture]) -> Iterator[Picture]:
-        """The same pictures of a camera."""
+        """The same pictures of a camera, whose masks are kept."""
         for picture in pictures:
             self._packed.setdefault(key, []).append(np.packbits(picture.unseen, axis=-1))
             self._width[key] = picture.unseen.shape[1]
@@ -84,42 +88,43 @@ class UnseenMasks:
         return masks | {f"{key}.width": np.array(width) for key, width in self._width.items()}
 
 
-def _drawn(
+def _rendered(
     scene: Reconstruction, camera: CameraTrack, frames: Tensor | None, fill: Fill = "none"
 ) -> Iterator[tuple[Rendering, list[Coverage], Float[Tensor, "#t #h #w 3"]]]:
-    """Some frames at a time through another camera, what is known about them, and what stands where nothing is."""
+    """Some frames at a time through another camera, what is known about them, and what fills their holes."""
     frames = torch.arange(len(scene.camera)) if frames is None else frames
     for window, part in scene.stretches(frames):
-        drawn, evidence = window.scene, window.evidence
         times, poses = frames[part] - window.start, camera.select(part)
-        once = _still_filled(drawn, poses, times, fill) if poses.is_static and fill != "none" else None
+        once = poses.is_static and fill != "none"
+        filling = _filled_background(window.scene, poses, times, fill) if once else None
         done = 0
-        for rendering in render_frames(drawn, poses, times, extra=evidence.moving_frames):
+        for rendering in render_frames(window.scene, poses, times, extra=window.evidence.moving_frames):
             batch = slice(done, done + len(rendering.alpha))
             done = batch.stop
             if fill == "none":
                 behind = rendering.rgb.new_zeros(1, 1, 1, 3)
-            elif once is None:
+            elif filling is None:
                 behind = torch.stack([_filled(rendering, i, fill) for i in range(len(rendering.alpha))])
             else:
-                behind = once * _brightness(drawn, times[batch], times)
-            yield rendering, coverage_of(rendering, poses.select(batch), times[batch], evidence), behind
+                behind = filling * _brightness(window.scene, times[batch], times)
+            yield rendering, coverage_of(rendering, poses.select(batch), times[batch], window.evidence), behind
 
 
 def _filled(rendering: Rendering, i: int, fill: Fill) -> Float[Tensor, "h w 3"]:
+    """One frame of a rendering with its holes filled, on the rendering's device."""
     picture = to_device((rendering.rgb[i], rendering.alpha[i], rendering.depth[i]), "cpu")
     return filled(*picture, fill).to(rendering.rgb.device)
 
 
-def _still_filled(scene: DynamicScene, camera: CameraTrack, times: Tensor, fill: Fill) -> Float[Tensor, "1 h w 3"]:
-    """What stands still through a fixed camera, filled once for all frames, so that nothing flickers."""
+def _filled_background(scene: DynamicScene, camera: CameraTrack, times: Tensor, fill: Fill) -> Float[Tensor, "1 h w 3"]:
+    """The background through a fixed camera, filled once for all frames, so that nothing flickers."""
     middle = [len(times) // 2]
     rendering = next(render_frames(scene.still(), camera.select(middle), times[middle]))
     return _filled(rendering, 0, fill)[None]
 
 
 def _brightness(scene: DynamicScene, times: Tensor, all_times: Tensor) -> Float[Tensor, "t 1 1 1"] | float:
-    """Mean brightness of what stands still at some times, relative to the middle one."""
+    """Mean brightness of the background at some times, relative to the middle one."""
     if scene.shading is None:
         return 1.0
     middle = all_times[len(all_times) // 2]

@@ -12,8 +12,10 @@ import yaml
 from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.core import config as config_module
 from lerobot_msdyn.core.cli import format_help, parse_config, read_recipe, recipe_folder
-from lerobot_msdyn.core.config import JitterConfig, OrbitConfig, Recipe
+from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import ConfigError
+from lerobot_msdyn.views.perturbations.jitter import Jitter
+from lerobot_msdyn.views.perturbations.orbit import Orbit
 
 PROJECT = Path(__file__).parents[2]
 RECIPES = sorted((PROJECT / "recipes").rglob("*.yaml"))
@@ -49,9 +51,9 @@ def test_a_switch_needs_no_value() -> None:
 
 
 def test_another_perturbation_type_drops_the_fields_of_the_old_one() -> None:
-    assert parse("--perturbation.azimuth_deg", "4").perturbation == OrbitConfig(azimuth_deg=4.0)
+    assert parse("--perturbation.azimuth_deg", "4").perturbation == Orbit(azimuth_deg=4.0)
     found = parse("--recipe", "quick", "--perturbation.type", "jitter", "--perturbation.rotation_deg", "2")
-    assert found.perturbation == JitterConfig(rotation_deg=2.0)
+    assert found.perturbation == Jitter(rotation_deg=2.0)
 
 
 @pytest.mark.parametrize(

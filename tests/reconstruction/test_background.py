@@ -17,7 +17,7 @@ from lerobot_msdyn.reconstruction.background import (
 )
 from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.rendering import render_scene
-from lerobot_msdyn.views.perturbation import orbit_offset
+from lerobot_msdyn.views.offsets import orbit_offset
 
 WIDTH, HEIGHT = 32, 24
 

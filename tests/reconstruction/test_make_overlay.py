@@ -15,7 +15,7 @@ from lerobot_msdyn.reconstruction.make_overlay import unexplained
 from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.rendering import render_scene
 from lerobot_msdyn.scene.store import load_scene, save_scene
-from lerobot_msdyn.views.perturbation import orbit_offset
+from lerobot_msdyn.views.offsets import orbit_offset
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 4
 NEAR, FAR = 0.8, 1.0  # m

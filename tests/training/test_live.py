@@ -1,4 +1,4 @@
-"""Frames that are drawn for training are those that the renderer draws."""
+"""Frames that are rendered for training are those of the renderer."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -14,8 +14,8 @@ from lerobot_msdyn.scene import store as saved
 from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.rendering import render_scene
 from lerobot_msdyn.scene.store import SavedScene
-from lerobot_msdyn.training.live import LiveScene, filled
-from lerobot_msdyn.views.perturbation import orbit_offset
+from lerobot_msdyn.training.live import LiveScene
+from lerobot_msdyn.views.offsets import orbit_offset
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ def with_field(scene: DynamicScene) -> DynamicScene:
 
 
 @pytest.mark.parametrize("change", [lambda scene: scene, turning, with_field], ids=["fitted", "turning", "field"])
-def test_the_same_picture_as_the_renderer_draws(scene: SavedScene, change: object) -> None:
+def test_the_same_picture_as_that_of_the_renderer(scene: SavedScene, change: object) -> None:
     scene = replace(scene, windows=tuple(change(window) for window in scene.windows))
     frames = torch.tensor([2, 8, 9])
     recorded = scene.camera.select(frames)
@@ -65,7 +65,7 @@ def test_the_same_picture_as_the_renderer_draws(scene: SavedScene, change: objec
     camera = replace(recorded, world_from_camera=recorded.world_from_camera @ offset)
     live = LiveScene(scene)
     for _ in range(2):  # buffers are used again
-        found = live.draw(camera, frames)
+        found = live.render(camera, frames)
     for i, frame in enumerate(frames.tolist()):
         number = int(frame >= 6)
         with torch.no_grad():
@@ -82,19 +82,4 @@ def test_the_same_picture_as_the_renderer_draws(scene: SavedScene, change: objec
 
 def test_depth_without_true_scale_is_unknown(scene: SavedScene) -> None:
     live = LiveScene(replace(scene, metric=False))
-    assert (live.draw(scene.camera.select([0]), torch.tensor([0])).depth == 0).all()
-
-
-def test_holes_take_the_colour_around_them() -> None:
-    rgb = np.full((3, 40, 60), 100, np.uint8)
-    rgb[:, :, 30:] = 200
-    known = np.ones((40, 60), bool)
-    known[10:30, 5:15] = False
-    rgb[:, ~known] = 0
-    found = filled(rgb, known)
-    assert np.abs(found[:, ~known].astype(int) - 100).max() < 15
-    assert (found[:, known] == rgb[:, known]).all()
-    assert (filled(rgb, np.zeros_like(known)) == rgb).all(), "with nothing known nothing is invented"
-    single = np.zeros_like(known)
-    single[20, 30] = True
-    assert np.abs(filled(rgb, single)[:, ~single].astype(int) - 200).max() < 5
+    assert (live.render(scene.camera.select([0]), torch.tensor([0])).depth == 0).all()

@@ -9,11 +9,12 @@ import pytest
 import torch
 from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
 
-from lerobot_msdyn.core.config import JitterConfig, OrbitConfig
 from lerobot_msdyn.core.errors import ConfigError, DatasetError, MsdynError
 from lerobot_msdyn.dataset import provenance
 from lerobot_msdyn.scene import store as saved
 from lerobot_msdyn.training import MixedViews
+from lerobot_msdyn.views.perturbations.jitter import Jitter
+from lerobot_msdyn.views.perturbations.orbit import Orbit
 
 FRONT, SIDE = "observation.images.front", "observation.images.side"
 DEPTH = f"{FRONT}_depth"
@@ -35,7 +36,7 @@ def assert_same_but(a: dict, b: dict, changed: set[str]) -> None:
 
 
 @pytest.mark.parametrize("options", [{}, {"return_uint8": True}, {"delta_timestamps": WINDOW}])
-def test_only_the_drawn_cameras_change(desk: Path, desk_scenes: Path, options: dict) -> None:
+def test_only_the_rendered_cameras_change(desk: Path, desk_scenes: Path, options: dict) -> None:
     dataset = recorded(desk, **options)
     mixed = MixedViews(dataset, desk_scenes, 1.0)
     for index in (0, 5, 23):
@@ -116,11 +117,9 @@ def test_workers_change_nothing(desk: Path, desk_scenes: Path, workers: int, con
 
 def test_perturbations(desk: Path, desk_scenes: Path) -> None:
     dataset = recorded(desk)
-    assert MixedViews(dataset, desk_scenes).mixer.perturbation == OrbitConfig(azimuth_deg=8.0), "that of the run"
-    assert MixedViews(dataset, desk_scenes / saved.FOLDER).mixer.perturbation == OrbitConfig(azimuth_deg=8.0)
-    still = MixedViews(
-        dataset, desk_scenes, 1.0, JitterConfig(translation_m=0.0, translation_rel=0.0, rotation_deg=0.0)
-    )
+    assert MixedViews(dataset, desk_scenes).mixer.perturbation == Orbit(azimuth_deg=8.0), "that of the run"
+    assert MixedViews(dataset, desk_scenes / saved.FOLDER).mixer.perturbation == Orbit(azimuth_deg=8.0)
+    still = MixedViews(dataset, desk_scenes, 1.0, Jitter(translation_m=0.0, translation_rel=0.0, rotation_deg=0.0))
     assert (still[3][FRONT] - dataset[3][FRONT]).abs().mean() < 0.06
 
 
@@ -174,8 +173,7 @@ def test_episodes_that_the_gate_refused_stay_as_recorded(
 
 def test_a_view_of_nothing_is_brought_nearer(desk: Path, desk_scenes: Path) -> None:
     far, near = (
-        OrbitConfig(azimuth_deg=factor * 12.0, elevation_deg=0.0, translation_m=0.0, translation_rel=0.0)
-        for factor in (4, 1)
+        Orbit(azimuth_deg=factor * 12.0, elevation_deg=0.0, translation_m=0.0, translation_rel=0.0) for factor in (4, 1)
     )
     bounded, quarter = (MixedViews(recorded(desk), desk_scenes, 1.0, kind) for kind in (far, near))
     bounded.mixer.max_empty, quarter.mixer.max_empty = 0.0, 1.0
@@ -187,7 +185,7 @@ def test_a_view_of_nothing_is_brought_nearer(desk: Path, desk_scenes: Path) -> N
 def test_scenes_from_memory(desk: Path, desk_scenes: Path) -> None:
     folders = saved.list_scenes(desk_scenes)
     scenes = {0: {FRONT: saved.load(folders[0][FRONT])}}
-    mixed = MixedViews(recorded(desk), scenes, 1.0, OrbitConfig(azimuth_deg=8.0))
+    mixed = MixedViews(recorded(desk), scenes, 1.0, Orbit(azimuth_deg=8.0))
     assert torch.equal(mixed[3][FRONT], MixedViews(recorded(desk), desk_scenes, 1.0)[3][FRONT])
 
 

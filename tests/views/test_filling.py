@@ -1,9 +1,10 @@
 """What stands where nobody has seen anything."""
 
+import numpy as np
 import pytest
 import torch
 
-from lerobot_msdyn.views.filling import filled, missing
+from lerobot_msdyn.views.filling import filled, filled_softly, missing
 
 
 def beside_an_object() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -38,3 +39,18 @@ def test_nothing_or_everything_known() -> None:
 
 def test_solid_surfaces_are_left_as_they_are() -> None:
     assert missing(torch.tensor([0.0, 0.45, 0.9, 1.0])).tolist() == pytest.approx([1.0, 0.5, 0.0, 0.0])
+
+
+def test_soft_filling_takes_the_colour_around_a_hole() -> None:
+    rgb = np.full((3, 40, 60), 100, np.uint8)
+    rgb[:, :, 30:] = 200
+    known = np.ones((40, 60), bool)
+    known[10:30, 5:15] = False
+    rgb[:, ~known] = 0
+    found = filled_softly(rgb, known)
+    assert np.abs(found[:, ~known].astype(int) - 100).max() < 15
+    assert (found[:, known] == rgb[:, known]).all()
+    assert (filled_softly(rgb, np.zeros_like(known)) == rgb).all(), "with nothing known nothing is invented"
+    single = np.zeros_like(known)
+    single[20, 30] = True
+    assert np.abs(filled_softly(rgb, single)[:, ~single].astype(int) - 200).max() < 5

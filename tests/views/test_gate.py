@@ -23,7 +23,7 @@ from lerobot_msdyn.reconstruction.self_check import (
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.views.expected_error import expected_error
 from lerobot_msdyn.views.gate import Scores, judge, reasons, record
-from lerobot_msdyn.views.perturbation import orbit_offset
+from lerobot_msdyn.views.offsets import orbit_offset
 
 FRAMES, WIDTH, HEIGHT = 30, 64, 48
 HELD_OUT = [7, 14, 22]  # of so many frames, by the default number

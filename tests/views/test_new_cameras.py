@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_msdyn.core.config import PosesConfig, Recipe, TranslationConfig
+from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.reconstruction.reconstruct import reconstruct
 from lerobot_msdyn.reconstruction.result import Reconstruction
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.views.new_cameras import SMALLEST, covered_rectangle, largest_factor, new_cameras
+from lerobot_msdyn.views.perturbations.poses import Poses
+from lerobot_msdyn.views.perturbations.translation import Translation
 from lerobot_msdyn.views.pictures import coverages
 
 
@@ -36,23 +38,21 @@ def test_largest_factor_is_found_by_bisection() -> None:
 
 
 def test_a_change_that_shows_too_much_is_shrunk(scenes: dict[str, Reconstruction]) -> None:
-    settings = recipe(perturbation=TranslationConfig(translation_m=0.6), max_unseen=0.15)
+    settings = recipe(perturbation=Translation(translation_m=0.6), max_unseen=0.15)
     found = new_cameras(scenes, settings, 0, 0)
     assert not found.rejected
-    assert SMALLEST <= found.drawn["front"]["shrunk_to"] < 1
+    assert SMALLEST <= found.amounts["front"]["shrunk_to"] < 1
     shares = [coverage.unseen_share for coverage in coverages(scenes["front"], found.cameras["front"])]
     assert 0.05 < max(shares) <= 0.16
 
 
 def test_what_cannot_be_shrunk_is_rejected(scenes: dict[str, Reconstruction]) -> None:
     back = [*torch.eye(4)[:2].flatten().tolist(), 0.0, 0.0, 1.0, 2.0]  # 2 m along the optical axis
-    assert (
-        "unseen" in new_cameras(scenes, recipe(max_unseen=0.0, perturbation=PosesConfig(poses=[back])), 0, 0).rejected
-    )
+    assert "unseen" in new_cameras(scenes, recipe(max_unseen=0.0, perturbation=Poses(poses=[back])), 0, 0).rejected
 
 
 def test_a_crop_shows_only_what_was_seen(scenes: dict[str, Reconstruction]) -> None:
-    settings = recipe(perturbation=TranslationConfig(translation_m=0.1), max_unseen=1.0)
+    settings = recipe(perturbation=Translation(translation_m=0.1), max_unseen=1.0)
     camera = new_cameras(scenes, settings, 0, 1).cameras["front"]
     cropped = new_cameras(scenes, dataclasses.replace(settings, crop_to_covered=True), 0, 1).cameras["front"]
     assert (cropped.width, cropped.height) == (camera.width, camera.height)
@@ -75,7 +75,7 @@ def test_covered_rectangle() -> None:
 def test_a_pose_behind_the_table_is_refused(scenes: dict[str, Reconstruction]) -> None:
     ahead = [*torch.eye(4)[:2].flatten().tolist(), 0.0, 0.0, 1.0, -3.0]  # 3 m along the optical axis
     with pytest.raises(ConfigError, match="behind what the recorded camera of episode 0 sees") as caught:
-        new_cameras(scenes, recipe(perturbation=PosesConfig(poses=[ahead])), 0, 0)
+        new_cameras(scenes, recipe(perturbation=Poses(poses=[ahead])), 0, 0)
     assert "\n" not in str(caught.value)
 
 

@@ -53,7 +53,7 @@ def mixed(dataset: Any, config: MixedViewsConfig) -> MixedViews | MixedStream:
     kind = MixedStream if isinstance(dataset, StreamingLeRobotDataset) else MixedViews
     views = kind(dataset, config.scenes, config.probability, perturbation, config.seed, memory_mb=config.memory_mb)
     logger.info(
-        "training on mixed views: %g %% of the samples of %d episodes are drawn from %s",
+        "training on mixed views: %g %% of the samples of %d episodes are rendered from %s",
         100 * config.probability,
         len(views.mixer.cache.scenes),
         config.scenes,

@@ -1,0 +1,29 @@
+"""The camera turned about the point it looks at, and shifted."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from lerobot_msdyn.core.fields import between
+from lerobot_msdyn.core.perturbation import Perturbation, Viewpoint
+
+
+@Perturbation.register_subclass("orbit")
+@dataclass
+class Orbit(Perturbation):
+    """Turn the camera about the point it looks at, and shift it."""
+
+    moves_rig: ClassVar[bool] = True
+
+    # Largest turn to either side, in degrees.
+    azimuth_deg: float = between(10.0, 0, 90)
+    # Largest turn up or down, in degrees.
+    elevation_deg: float = between(5.0, 0, 60)
+    # Largest shift along each of the camera's axes in metres, where the scale is metric.
+    translation_m: float = between(0.02, 0, 10)
+    # The same as a fraction of the distance to the look-at point, where it is not.
+    translation_rel: float = between(0.03, 0, 0.9)
+
+    def bounds(self, view: Viewpoint) -> dict[str, int | float]:
+        """Both angles, and a shift along all axes."""
+        angles = {"azimuth_deg": self.azimuth_deg, "elevation_deg": self.elevation_deg}
+        return angles | view.shifts(self.translation_m, self.translation_rel)
