@@ -80,7 +80,8 @@ def show_episode(config: ViewerConfig, stream: "rr.RecordingStream") -> None:
     Raises:
         DatasetError: there is no such dataset or episode, or the scenes hold none of it.
     """
-    from lerobot_msdyn.dataset.read import open_source, read_episode, select_cameras, select_episodes
+    from lerobot_msdyn.dataset.read import open_source, read_episode
+    from lerobot_msdyn.dataset.select import select_cameras, select_episodes
     from lerobot_msdyn.priors import estimate_priors
     from lerobot_msdyn.scene import store as saved
 

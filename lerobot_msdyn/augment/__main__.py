@@ -66,7 +66,8 @@ def run(arguments: list[str]) -> int:
 def _open(config: AugmentConfig, root: Path | None) -> tuple["LeRobotDatasetMetadata", list[int], list[str]]:
     """The source, its episodes and its cameras."""
     from lerobot_msdyn.augment.moving_cameras import still_cameras
-    from lerobot_msdyn.dataset.read import open_source, select_cameras, select_episodes
+    from lerobot_msdyn.dataset.read import open_source
+    from lerobot_msdyn.dataset.select import select_cameras, select_episodes
 
     source = open_source(config.repo_id, root)
     episodes = select_episodes(source, config.episodes)

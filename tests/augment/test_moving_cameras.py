@@ -2,15 +2,14 @@
 
 from pathlib import Path
 
-import pytest
 import torch
 
 from lerobot_msdyn.augment.moving_cameras import correlation, still_cameras, why_moving
 from lerobot_msdyn.core.cameras import intrinsics_from_fov, static_camera
 from lerobot_msdyn.core.config import Recipe
-from lerobot_msdyn.core.errors import DatasetError
 from lerobot_msdyn.core.observations import View
-from lerobot_msdyn.dataset.read import Episode, EpisodeSource, is_wrist_camera, open_source, select_cameras
+from lerobot_msdyn.dataset.read import Episode, EpisodeSource, open_source
+from lerobot_msdyn.dataset.select import select_cameras
 
 FRAMES, WIDTH, HEIGHT = 60, 160, 120
 
@@ -44,26 +43,6 @@ def test_a_camera_that_stands_or_moves_by_itself_is_not_refused() -> None:
     path = stop_and_go()
     assert why_moving(episode(torch.zeros(FRAMES), path[:, None]), "top") == ""
     assert why_moving(episode(2 * torch.arange(FRAMES), path[:, None]), "top") == ""
-
-
-@pytest.mark.parametrize("name", ["wrist", "left_hand", "gripper_cam", "eye_in_hand", "end_effector", "tool0"])
-def test_names_of_cameras_on_the_robot(name: str) -> None:
-    assert is_wrist_camera(f"observation.images.{name}")
-
-
-@pytest.mark.parametrize("name", ["front", "top", "overhead", "side", "laptop"])
-def test_names_of_cameras_beside_the_robot(name: str) -> None:
-    assert not is_wrist_camera(f"observation.images.{name}")
-
-
-def test_a_wrist_camera_is_rendered_only_where_that_is_allowed(image_desk: Path) -> None:
-    source = open_source("local/desk", image_desk)
-    wrist = "observation.images.wrist"
-    assert wrist not in select_cameras(source, None)
-    with pytest.raises(DatasetError, match=r"wrist moves with the robot, by its name.*--allow_moving"):
-        select_cameras(source, ["wrist"])
-    assert select_cameras(source, ["wrist"], allow_moving=True) == [wrist]
-    assert wrist in select_cameras(source, None, allow_moving=True)
 
 
 def test_cameras_on_stands_are_kept(desk: Path) -> None:

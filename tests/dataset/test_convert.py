@@ -8,7 +8,9 @@ import torch
 
 from lerobot_msdyn.core.errors import DatasetError
 from lerobot_msdyn.dataset.convert import converted_copy
-from lerobot_msdyn.dataset.read import colour_cameras, open_source, read_colour, read_rows
+from lerobot_msdyn.dataset.read import open_source, read_colour
+from lerobot_msdyn.dataset.rows import read_rows
+from lerobot_msdyn.dataset.select import colour_cameras
 
 
 def legacy(root: Path, **changes: object) -> Path:
