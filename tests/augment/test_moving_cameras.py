@@ -2,11 +2,15 @@
 
 from pathlib import Path
 
+import pytest
 import torch
+from lerobot.datasets import LeRobotDatasetMetadata
 
+from lerobot_msdyn.augment import moving_cameras
 from lerobot_msdyn.augment.moving_cameras import correlation, still_cameras, why_moving
 from lerobot_msdyn.core.cameras import intrinsics_from_fov, static_camera
 from lerobot_msdyn.core.config import Recipe
+from lerobot_msdyn.core.errors import DatasetError, EpisodeError
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.dataset.read import Episode, EpisodeSource, open_source
 from lerobot_msdyn.dataset.select import select_cameras
@@ -48,4 +52,31 @@ def test_a_camera_that_stands_or_moves_by_itself_is_not_refused() -> None:
 def test_cameras_on_stands_are_kept(desk: Path) -> None:
     source = open_source("local/desk", desk)
     cameras = select_cameras(source, None)
-    assert still_cameras(source, 0, cameras, Recipe()) == cameras
+    assert still_cameras(source, [0], cameras, Recipe()) == cameras
+
+
+@pytest.fixture
+def on_the_arm(desk: Path, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Episode 0 of `desk` cannot be read, and all cameras move with the robot; the episodes that were asked for."""
+    asked: list[int] = []
+
+    def read(source: LeRobotDatasetMetadata, index: int, *rest: object, **more: object) -> Episode:
+        asked.append(index)
+        if index == 0:
+            raise EpisodeError("local/desk episode 0: it is damaged")
+        return episode(stop_and_go().round(), stop_and_go()[:, None])
+
+    monkeypatch.setattr(moving_cameras, "read_episode", read)
+    return asked
+
+
+def test_an_episode_that_cannot_be_read_lets_no_camera_pass(desk: Path, on_the_arm: list[int]) -> None:
+    source = open_source("local/desk", desk)
+    with pytest.raises(DatasetError, match=r"top is refused: its background moves.*with the robot"):
+        still_cameras(source, [0, 1, 2], ["top"], Recipe())
+    assert on_the_arm == [0, 1]
+
+
+def test_where_no_episode_can_be_read_no_camera_passes(desk: Path, on_the_arm: list[int]) -> None:
+    with pytest.raises(EpisodeError, match=r"none of 1 episodes can be read.*First: .*episode 0: it is damaged"):
+        still_cameras(open_source("local/desk", desk), [0], ["top"], Recipe())

@@ -11,9 +11,10 @@ import yaml
 
 from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.core import config as config_module
-from lerobot_msdyn.core.cli import format_help, parse_config, read_recipe, recipe_folder
+from lerobot_msdyn.core.cli import format_help, parse_config
 from lerobot_msdyn.core.config import JitterConfig, OrbitConfig, Recipe
 from lerobot_msdyn.core.errors import ConfigError
+from lerobot_msdyn.core.recipe_files import read_recipe, recipe_folder
 
 PROJECT = Path(__file__).parents[2]
 RECIPES = sorted((PROJECT / "recipes").rglob("*.yaml"))
