@@ -14,6 +14,7 @@ import numpy as np
 from lerobot_msdyn.core.cli import EXIT_OK, parse_config, run_command
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import ConfigError, DatasetError, MsdynError, OutputError
+from lerobot_msdyn.core.fields import MAX_INDEX, between
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -37,7 +38,7 @@ class ViewerConfig(Recipe):
     # Exact folder of the source dataset; default: LeRobot's home, then the hub.
     root: Path | None = None
     # The episode to show.
-    episode: int = 0
+    episode: int = between(0, 0, MAX_INDEX)
     # Output folder of `augment --save_scenes true`; without it the episode is fitted first.
     scenes: Path | None = None
     # A .rrd file to write instead of opening a window.

@@ -10,7 +10,7 @@ from typing import Literal
 
 import draccus
 
-from lerobot_msdyn.core.fields import INFINITY, between, one_of
+from lerobot_msdyn.core.fields import INFINITY, MAX_SEED, between, one_of
 
 # Named: draccus finds the comment above a field only where its annotation holds no quotes.
 Device = Literal["auto", "cpu", "cuda"]
@@ -352,7 +352,7 @@ class Recipe:
     # Whether the reconstructed scenes are kept in the output, for training on views of them (docs/scenes.md).
     save_scenes: bool = False
     # Seed of every random choice; together with the episode and the variant it fixes the result.
-    seed: int = 0
+    seed: int = between(0, 0, MAX_SEED)
     # auto, cpu or cuda; auto takes a GPU where everything is there to draw on it (docs/gpu.md).
     device: Device = "auto"
     # Whether a GPU encodes new H.264 and HEVC videos where it can: faster, but not as the source's encoder would.
