@@ -12,7 +12,8 @@ from numpy import ndarray
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.observations import View
-from lerobot_msdyn.dataset.read import open_source, read_episode, select_cameras
+from lerobot_msdyn.dataset.read import open_source, read_episode
+from lerobot_msdyn.dataset.select import select_cameras
 from lerobot_msdyn.priors import Priors, estimate_priors
 from lerobot_msdyn.priors.exchange import from_priors, write_exchange
 

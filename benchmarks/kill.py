@@ -18,6 +18,7 @@ import time
 from pathlib import Path
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command does, before torch is loaded
 
 # Imported once: the processes to kill are forked from this one, and spend their time on the work itself.
 from lerobot_msdyn.augment import __main__ as augment

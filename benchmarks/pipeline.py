@@ -16,6 +16,7 @@ else the machine does. The baseline is that of `--small --steps 40 --json benchm
 import argparse
 import json
 import multiprocessing
+import os
 import resource
 import sys
 import tempfile
@@ -167,6 +168,7 @@ def main() -> int:
     parser.add_argument("--gate", action="store_true", help=f"fail where something grows more than in {BASELINE.name}")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # of the processes that are started; as the command does
     rows: list[dict] = []
     columns = (*STAGES, "all", "peak MB")
     sys.stdout.write(f"{'seconds':14s}" + "".join(f"{name:>{max(9, len(name) + 2)}s}" for name in columns) + "\n")

@@ -44,7 +44,8 @@ from numpy import ndarray
 from lerobot_msdyn.core.config import CameraConfig, PriorsConfig, Recipe
 from lerobot_msdyn.core.geometry import quaternion_to_matrix
 from lerobot_msdyn.core.observations import View
-from lerobot_msdyn.dataset.read import open_source, read_episode, select_cameras
+from lerobot_msdyn.dataset.read import open_source, read_episode
+from lerobot_msdyn.dataset.select import select_cameras
 from lerobot_msdyn.priors import PointTracks, estimate_priors
 from lerobot_msdyn.priors.depth.table_plane import table_plane_depth
 from lerobot_msdyn.priors.masks.moving import moving_instances, temporal_median

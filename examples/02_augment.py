@@ -10,7 +10,7 @@ from pathlib import Path
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_msdyn import OutputDataset, augment_episode, load_recipe, open_source
-from lerobot_msdyn.dataset.read import select_cameras
+from lerobot_msdyn.dataset.select import select_cameras
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.dataset import write_dataset
 

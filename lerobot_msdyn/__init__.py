@@ -1,11 +1,11 @@
-"""New camera viewpoints for LeRobot datasets; the public names, each imported when it is first used."""
+"""New camera viewpoints for LeRobot datasets; the public names, each imported when it is first used.
+
+Importing this package changes no setting of the process. For speed on a busy machine, set OMP_WAIT_POLICY=PASSIVE
+before torch is imported, as the package's commands do (docs/rasterizer.md).
+"""
 
 import importlib
-import os
 from typing import Any
-
-# Idle OpenMP threads of torch would otherwise spin on the cores that the rasterizer needs. Read when torch is loaded.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 _HOMES = {
     "CameraTrack": "core.cameras",

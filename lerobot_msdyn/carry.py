@@ -1,4 +1,4 @@
-"""Command line: give a dataset that LeRobot's tools made of others its meta/msdyn/, which they leave behind.
+"""Command line: write meta/msdyn/ for a dataset that LeRobot's tools made of others; they leave it behind.
 
 python -m lerobot_msdyn.carry --root MERGED --sources '[FOLDER, FOLDER]'
 """

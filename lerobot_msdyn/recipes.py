@@ -6,8 +6,9 @@ python -m lerobot_msdyn.recipes ls | show NAME | check FILE
 import sys
 from pathlib import Path
 
-from lerobot_msdyn.core.cli import EXIT_OK, load_recipe, recipe_folder, recipe_path, run_command
+from lerobot_msdyn.core.cli import EXIT_OK, load_recipe, run_command
 from lerobot_msdyn.core.errors import ConfigError
+from lerobot_msdyn.core.recipe_files import packaged_recipes, recipe_path
 
 USAGE = """usage: python -m lerobot_msdyn.recipes ls           name and purpose of every recipe
        python -m lerobot_msdyn.recipes show NAME    one recipe, to copy and change
@@ -22,7 +23,7 @@ def run(arguments: list[str]) -> int:
         return EXIT_OK
     match arguments:
         case ["ls"]:
-            sys.stdout.write("".join(f"{path.stem:14s}{purpose(path)}\n" for path in known_recipes()))
+            sys.stdout.write("".join(f"{path.stem:14s}{purpose(path)}\n" for path in packaged_recipes()))
         case ["show", name]:
             sys.stdout.write(recipe_path(name).read_text(encoding="utf-8"))
         case ["check", name]:
@@ -31,11 +32,6 @@ def run(arguments: list[str]) -> int:
         case _:
             raise ConfigError(f"recipes: got {' '.join(arguments)!r}; expected ls, show NAME or check FILE")
     return EXIT_OK
-
-
-def known_recipes() -> list[Path]:
-    """The files of the recipes that come with the package."""
-    return sorted(recipe_folder().glob("*.yaml"))
 
 
 def purpose(path: Path) -> str:

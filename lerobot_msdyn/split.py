@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from lerobot_msdyn.core.cli import EXIT_OK, parse_config, run_command
 from lerobot_msdyn.core.errors import ConfigError, DatasetError
+from lerobot_msdyn.core.fields import between
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDatasetMetadata
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 COMMAND = "python -m lerobot_msdyn.split"
+DIGITS = 6  # of the share that is passed to LeRobot
 
 
 @dataclass
@@ -28,10 +30,7 @@ class SplitConfig:
     # Exact folder of the dataset.
     root: Path | None = None
     # Share of each task's recordings that is held out.
-    eval_split: float = 0.2
-
-
-DIGITS = 6  # of the share that is passed to LeRobot
+    eval_split: float = between(0.2, 10**-DIGITS, 1 - 10**-DIGITS)
 
 
 @dataclass(frozen=True)

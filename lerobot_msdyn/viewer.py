@@ -14,6 +14,7 @@ import numpy as np
 from lerobot_msdyn.core.cli import EXIT_OK, parse_config, run_command
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import ConfigError, DatasetError, MsdynError, OutputError
+from lerobot_msdyn.core.fields import MAX_INDEX, between
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -40,7 +41,7 @@ class ViewerConfig(Recipe):
     # Exact folder of the source dataset; default: LeRobot's home, then the hub.
     root: Path | None = None
     # The episode to show.
-    episode: int = 0
+    episode: int = between(0, 0, MAX_INDEX)
     # Output folder of `augment --save_scenes true`; without it the episode is fitted first.
     scenes: Path | None = None
     # A .rrd file to write instead of opening a window.
@@ -79,7 +80,8 @@ def show_episode(config: ViewerConfig, stream: "rr.RecordingStream") -> None:
         ConfigError: the perturbation needs what is not kept with scenes.
         DatasetError: there is no such dataset or episode, or the scenes hold none of it.
     """
-    from lerobot_msdyn.dataset.read import open_source, read_episode, select_cameras, select_episodes
+    from lerobot_msdyn.dataset.read import open_source, read_episode
+    from lerobot_msdyn.dataset.select import select_cameras, select_episodes
     from lerobot_msdyn.priors import estimate_priors
     from lerobot_msdyn.scene import store
     from lerobot_msdyn.views.camera_change import check_pose

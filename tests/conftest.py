@@ -1,4 +1,4 @@
-"""Small made-up datasets that several tests share; nothing is downloaded."""
+"""Small synthetic datasets that several tests share; nothing is downloaded."""
 
 import logging
 import os
@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as commands do, before torch is loaded
 
 from lerobot_msdyn.augment import __main__ as augment
 from lerobot_msdyn.synthetic import make_scene

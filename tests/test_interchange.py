@@ -22,7 +22,8 @@ from lerobot_msdyn.core.errors import DatasetError
 from lerobot_msdyn.dataset.card import card_arguments
 from lerobot_msdyn.dataset.lineage import recordings
 from lerobot_msdyn.dataset.provenance import SOURCE_VARIANT, Provenance, read_provenance
-from lerobot_msdyn.dataset.read import open_source, read_colour, read_rows
+from lerobot_msdyn.dataset.read import open_source, read_colour
+from lerobot_msdyn.dataset.rows import read_rows
 from lerobot_msdyn.dataset.write import NewEpisode, OutputDataset
 from lerobot_msdyn.split import split_by_source
 

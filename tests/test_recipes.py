@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_msdyn.core.errors import ConfigError
-from lerobot_msdyn.recipes import known_recipes, run
+from lerobot_msdyn.recipes import run
 
 PROJECT = Path(__file__).parent.parent
 NAMES = ["balanced", "best", "multi_camera", "quick", "rgbd", "so101_front"]
@@ -81,4 +81,3 @@ def test_help_and_no_argument_say_how_it_is_used(capsys: pytest.CaptureFixture[s
     for arguments in ([], ["--help"]):
         assert run(arguments) == 0
         assert "show NAME" in capsys.readouterr().out
-    assert known_recipes()

@@ -28,5 +28,8 @@ def test_recipes_are_in_the_wheel_and_found_by_name(tmp_path: Path) -> None:
 
     listed = [line.split()[0] for line in said("-m", "lerobot_msdyn.recipes", "ls").splitlines()]
     assert listed == sorted(path.stem for path in (PROJECT / "recipes").glob("*.yaml"))
-    code = "from lerobot_msdyn.core.cli import *; print(recipe_folder(), load_recipe('quick').variants)"
+    code = (
+        "from lerobot_msdyn.core.cli import load_recipe; from lerobot_msdyn.core.recipe_files import recipe_folder; "
+        "print(recipe_folder(), load_recipe('quick').variants)"
+    )
     assert said("-c", code).split() == [str(tmp_path / "installed" / "lerobot_msdyn" / "recipe_files"), "1"]

@@ -33,8 +33,10 @@ def run(arguments: list[str]) -> int:
     from lerobot.utils.constants import HF_LEROBOT_HOME
 
     from lerobot_msdyn.dataset.staging import Staging, published_before
+    from lerobot_msdyn.dataset.video import quiet_encoders
     from lerobot_msdyn.dataset.write import check_place
 
+    quiet_encoders()
     root = config.root or HF_LEROBOT_HOME / config.repo_id
     new_repo_id = config.new_repo_id or f"{config.repo_id}_msdyn"
     new_root = config.new_root
@@ -66,13 +68,14 @@ def run(arguments: list[str]) -> int:
 def _open(config: AugmentConfig, root: Path | None) -> tuple["LeRobotDatasetMetadata", list[int], list[str]]:
     """The source, its episodes and its cameras."""
     from lerobot_msdyn.augment.moving_cameras import still_cameras
-    from lerobot_msdyn.dataset.read import open_source, select_cameras, select_episodes
+    from lerobot_msdyn.dataset.read import open_source
+    from lerobot_msdyn.dataset.select import select_cameras, select_episodes
 
     source = open_source(config.repo_id, root)
     episodes = select_episodes(source, config.episodes)
     cameras = select_cameras(source, config.cameras, allow_moving=config.allow_moving)
     if not config.allow_moving:
-        cameras = still_cameras(source, episodes[0], cameras, config)
+        cameras = still_cameras(source, episodes, cameras, config)
     return source, episodes, cameras
 
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_msdyn.core.config import Recipe
+from lerobot_msdyn.core.fields import between
 
 
 @dataclass
@@ -21,7 +22,7 @@ class AugmentConfig(Recipe):
     # Source episodes to use, e.g. '[0,3]'; default: all.
     episodes: list[int] | None = None
     # Processes that work on episodes at once; 0: one per core, as far as memory allows. The result is the same.
-    workers: int = 0
+    workers: int = between(0, 0, 1024)
     # Report what would be done (episodes, disk, time) and stop.
     dry_run: bool = False
     # Throw away what an unfinished run for the same output has finished, instead of going on with it.

@@ -12,10 +12,10 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from torch import Tensor
 
 from lerobot_msdyn.augment.backgrounds import Backgrounds
-from lerobot_msdyn.core.cameras import read_calibration
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.dataset.calibration import read_calibration
 from lerobot_msdyn.dataset.provenance import SOURCE_VARIANT, Provenance, camera_pose
 from lerobot_msdyn.dataset.read import depth_key_of, read_episode
 from lerobot_msdyn.dataset.staging import SCENE

@@ -2,6 +2,7 @@
 
 import itertools
 import logging
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -24,16 +25,18 @@ MIN_PAIRS = 8
 SMALL_PX = 160  # width at which pictures are compared
 
 
-def still_cameras(source: LeRobotDatasetMetadata, index: int, cameras: list[str], recipe: Recipe) -> list[str]:
-    """Those of the cameras that do not move with the robot in an episode; the others were left out, with the reason.
+def still_cameras(
+    source: LeRobotDatasetMetadata, episodes: Sequence[int], cameras: list[str], recipe: Recipe
+) -> list[str]:
+    """Those of the cameras that do not move with the robot, judged by the first episode that can be read.
+
+    The others are left out, with the reason.
 
     Raises:
         DatasetError: one that the recipe names moves, or no camera is left.
+        EpisodeError: none of the episodes can be read.
     """
-    try:
-        episode = read_episode(source, index, cameras, recipe.camera, recorded_depth=False)
-    except EpisodeError:  # reported when it is its turn
-        return cameras
+    episode = _first_readable(source, episodes, cameras, recipe)
     moving = {key: reason for key in cameras if (reason := why_moving(episode, key))}
     for key, reason in moving.items():
         message = f"{source.repo_id}: {key} is refused: {reason} (--allow_moving re-renders it all the same)"
@@ -41,6 +44,22 @@ def still_cameras(source: LeRobotDatasetMetadata, index: int, cameras: list[str]
             raise DatasetError(message)
         logger.warning(message)
     return [key for key in cameras if key not in moving]
+
+
+def _first_readable(
+    source: LeRobotDatasetMetadata, episodes: Sequence[int], cameras: list[str], recipe: Recipe
+) -> Episode:
+    """The first of some episodes that can be read; the others are reported when it is their turn."""
+    errors = []
+    for index in episodes:
+        try:
+            return read_episode(source, index, cameras, recipe.camera, recorded_depth=False)
+        except EpisodeError as error:
+            errors.append(error)
+    raise EpisodeError(
+        f"{source.repo_id}: none of {len(episodes)} episodes can be read, so nothing tells which cameras move with the "
+        f"robot, and there is nothing to augment. First: {errors[0]}"
+    )
 
 
 def why_moving(episode: Episode, key: str) -> str:

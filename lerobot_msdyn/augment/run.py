@@ -18,7 +18,6 @@ from lerobot_msdyn.augment.episode import augment_episode
 from lerobot_msdyn.augment.workers import Work, Workers, threads_of_one, workers_for
 from lerobot_msdyn.core.errors import EpisodeError, MsdynError
 from lerobot_msdyn.dataset.read import depth_key_of
-from lerobot_msdyn.dataset.video import quiet_encoders
 from lerobot_msdyn.dataset.write import NewEpisode, OutputDataset
 from lerobot_msdyn.render.devices import chosen_device
 
@@ -36,7 +35,6 @@ def run_local(
 ) -> tuple[list[NewEpisode], list[EpisodeError]]:
     """All episodes on this machine; an episode that cannot be read is reported and left out."""
     chosen_device(config.device)  # complains, or says what is used, before anything is done
-    quiet_encoders()
     _say_what_is_assumed(source, cameras, config)
     new: list[NewEpisode] = []
     failures: list[EpisodeError] = []

@@ -1,4 +1,7 @@
-"""What the result of a run depends on, so that a run that was stopped goes on only as itself."""
+"""What the result of a run depends on: an unfinished run goes on only under the same settings, files and code.
+
+It is compared when a run starts (`Staging.agree`) and stays in the work folder; nothing of it gets into the output.
+"""
 
 import dataclasses
 import hashlib

@@ -1,18 +1,14 @@
-"""Cameras over time, and where they come from: a calibration file, or a fixed camera with a default field of view."""
+"""Pinhole cameras over time, and the simplest of them: one that stands still with a given field of view."""
 
-import json
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lerobot_msdyn.core.errors import PriorError
-from lerobot_msdyn.core.geometry import invert_se3, se3
+from lerobot_msdyn.core.geometry import invert_se3
 
 
 @dataclass(frozen=True)
@@ -80,42 +76,3 @@ def static_camera(
         width,
         height,
     )
-
-
-def read_calibration(path: Path, camera: str, episode: int, frames: int, width: int, height: int) -> CameraTrack | None:
-    """The camera of one feature in a calibration file, or None if the file does not name it.
-
-    The file (JSON) holds `{"cameras": {NAME: {"K": 3x3, "R": 3x3, "t": 3}}}` or, where the rig moved between
-    episodes, `{"episodes": {"0": {"cameras": {...}}}}`. K is in pixels of the recorded image; R and t (metres) map
-    world to camera (OpenCV); without them the camera's own frame is the world's. NAME is the feature's key, its
-    last part (`front` for `observation.images.front`), or the number at its end (`0` for `observation.images.cam0`).
-
-    Raises:
-        PriorError: the file cannot be read or an entry has the wrong shape.
-    """
-    try:
-        content = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise PriorError(f"{path}: calibration cannot be read ({error}); expected a JSON file") from error
-    section = content.get("episodes", {}).get(str(episode), content)
-    cameras = section.get("cameras", {})
-    entry = next((cameras[name] for name in _names(camera) if name in cameras), None)
-    if entry is None:
-        return None
-    try:
-        intrinsics = torch.tensor(entry["K"], dtype=torch.float32).reshape(3, 3)
-        rotation = torch.tensor(entry.get("R", torch.eye(3).tolist()), dtype=torch.float64).reshape(3, 3)
-        translation = torch.tensor(entry.get("t", [0.0, 0.0, 0.0]), dtype=torch.float64).reshape(3)
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise PriorError(
-            f"{path}: camera {camera!r} has no usable K (3x3), R (3x3), t (3): {error}; see docs/calibration.md"
-        ) from error
-    world_from_camera = invert_se3(se3(rotation, translation)).float()
-    return replace(static_camera(intrinsics, frames, width, height, world_from_camera), origin="calibration")
-
-
-def _names(camera: str) -> list[str]:
-    """What a calibration file may call a camera."""
-    last = camera.rsplit(".", 1)[-1]
-    number = re.search(r"\d+$", last)
-    return [camera, last, *([number[0]] if number else [])]

@@ -5,10 +5,10 @@ import dataclasses
 import difflib
 import inspect
 import logging
+import os
 import sys
 import typing
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 import draccus
@@ -19,6 +19,7 @@ from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import ConfigError, MsdynError, one_line
 from lerobot_msdyn.core.fields import problems
 from lerobot_msdyn.core.plugins import import_plugins
+from lerobot_msdyn.core.recipe_files import packaged_recipes, read_recipe
 
 logger = logging.getLogger(__name__)
 
@@ -26,43 +27,6 @@ EXIT_OK = 0
 EXIT_SOME_EPISODES_FAILED = 1
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
-
-
-def recipe_folder() -> Path:
-    """The folder of the recipes that come with the package (in a checkout: at its top level)."""
-    installed = Path(__file__).parents[1] / "recipe_files"
-    return installed if installed.is_dir() else Path(__file__).parents[2] / "recipes"
-
-
-def recipe_path(name: str) -> Path:
-    """The file of a recipe, given by that file or by the name of one that comes with the package.
-
-    Raises:
-        ConfigError: there is no such recipe.
-    """
-    path = Path(name)
-    if not path.is_file():
-        path = recipe_folder() / f"{name}.yaml"
-    if not path.is_file():
-        known = sorted(file.stem for file in recipe_folder().glob("*.yaml"))
-        raise ConfigError(f"no recipe {name!r}: neither a file nor one of {', '.join(known)}")
-    return path
-
-
-def read_recipe(name: str) -> dict[str, Any]:
-    """The content of a recipe, given by its file or by the name of one that comes with the package.
-
-    Raises:
-        ConfigError: there is no such recipe, or it is not a YAML mapping.
-    """
-    path = recipe_path(name)
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f"recipe {path} is not readable YAML: {one_line(error)}") from error
-    if not isinstance(content, dict | None):
-        raise ConfigError(f"recipe {path} holds a {type(content).__name__}; expected a mapping of fields")
-    return content or {}
 
 
 def load_recipe(name: str) -> Recipe:
@@ -102,16 +66,16 @@ def parse_config[T](config_class: type[T], arguments: list[str], aliases: Mappin
         config = draccus.decode(config_class, content)
     except (draccus.utils.DraccusException, TypeError, ValueError, AttributeError) as error:
         raise ConfigError(one_line(error)) from error
-    found = problems(config)
-    if found:
-        raise ConfigError("; ".join(found))
+    wrong = problems(config)
+    if wrong:
+        raise ConfigError("; ".join(wrong))
     return typing.cast(T, config)
 
 
 def format_help(config_class: type, aliases: Mapping[str, str], command: str) -> str:
     """The help text of a command: every field with its default and the comment that stands above it."""
     names = ", ".join(f"--{alias} for --{name}" for alias, name in aliases.items())
-    recipes = ", ".join(sorted(file.stem for file in recipe_folder().glob("*.yaml")))
+    recipes = ", ".join(path.stem for path in packaged_recipes())
     head = (
         f"usage: {command} [--field value ...]\n\n{inspect.getdoc(config_class)}\n\n"
         f"  --recipe NAME_OR_FILE\n      A YAML file with any of the fields below, read before the flags; "
@@ -142,8 +106,12 @@ def _help_lines(config_class: type, prefix: str) -> Iterator[str]:
 def run_command(main: Callable[[list[str]], int], arguments: list[str] | None = None) -> None:
     """Run a command, report expected errors in one line, and exit.
 
+    Settings of the whole process (environment, logging) are made here alone: importing the package makes none.
     Exit codes: 0 all done, 1 some episodes failed, 2 bad input, 130 interrupted.
     """
+    # Idle OpenMP threads would otherwise spin on the cores that the rasterizer needs. Read when torch is loaded, which
+    # is why commands import it only when they run.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s", stream=sys.stderr)
     for name in ("lerobot", "httpx"):
         logging.getLogger(name).setLevel(logging.WARNING)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from lerobot_msdyn.core.fields import INFINITY, between, numbers_of, one_of
+from lerobot_msdyn.core.fields import INFINITY, MAX_SEED, between, numbers_of, one_of
 from lerobot_msdyn.core.perturbation import Perturbation
 from lerobot_msdyn.core.registries import LOSSES
 
@@ -205,7 +205,7 @@ class Recipe:
     # Whether the reconstructed scenes are kept in the output, for training on views of them (docs/scenes.md).
     save_scenes: bool = False
     # Seed of every random choice; together with the episode and the variant it fixes the result.
-    seed: int = 0
+    seed: int = between(0, 0, MAX_SEED)
     # auto, cpu or cuda; auto takes a GPU where everything is there to draw on it (docs/gpu.md).
     device: Device = "auto"
     # Whether a GPU encodes new H.264 and HEVC videos where it can: faster, but not as the source's encoder would.

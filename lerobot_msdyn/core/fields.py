@@ -9,6 +9,8 @@ Number = int | float
 
 INFINITY = float("inf")
 FILE = ".npz"  # ending of an exchange file
+MAX_INDEX = 1_000_000_000  # of an episode
+MAX_SEED = 4_294_967_295
 
 
 def between(default: Number, low: Number, high: Number) -> Any:
@@ -43,11 +45,11 @@ def problems(config: Any, prefix: str = "") -> list[str]:
             lines += _range_problems(value, name, *item.metadata["range"])
         elif "names" in item.metadata:
             registry: Registry | None = item.metadata["registry"]
-            known = [*item.metadata["names"], *(registry.names() if registry is not None else ())]
-            if value not in known and not value.endswith(FILE):
-                lines.append(f"{name} is {value!r}; expected {', '.join(known)} or a file FILE{FILE}")
-    own = getattr(config, "problems", None)
-    return lines + ([prefix + line for line in own()] if own is not None else [])
+            allowed = [*item.metadata["names"], *(registry.names() if registry is not None else ())]
+            if value not in allowed and not value.endswith(FILE):
+                lines.append(f"{name} is {value!r}; expected {', '.join(allowed)} or a file FILE{FILE}")
+    between_fields = getattr(config, "problems", None)
+    return lines + ([prefix + line for line in between_fields()] if between_fields is not None else [])
 
 
 def _dict_problems(values: dict[str, Any], name: str, metadata: Any) -> list[str]:

@@ -1,7 +1,9 @@
 """A converted copy of a dataset of version v2.1; the source stays as it is."""
 
+import contextlib
 import logging
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 from lerobot.scripts.convert_dataset_v21_to_v30 import convert_dataset
@@ -39,15 +41,28 @@ def converted_copy(repo_id: str, root: Path, folder: Path) -> Path:
                 target = copy / path.relative_to(root)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(regular_file(root, path.relative_to(root)), target)
-    level = logging.root.manager.disable
-    logging.disable(logging.WARNING)  # LeRobot tells about every field that only the old version had
     try:
-        with temporary_files_in(folder):
+        with temporary_files_in(folder), _lerobot_quiet():
             convert_dataset(repo_id, root=copy, push_to_hub=False)
     except Exception as error:  # several libraries read the files, each with errors of its own
         raise DatasetError(f"{root} cannot be converted by LeRobot's script ({first_line(error)})") from error
-    finally:
-        logging.disable(level)
     copy.rename(done)
     shutil.rmtree(copy.parent)
     return done
+
+
+@contextlib.contextmanager
+def _lerobot_quiet() -> Iterator[None]:
+    """Without LeRobot's line per file, which goes to the root logger, and per field that only the old version had."""
+
+    def worse(record: logging.LogRecord) -> bool:
+        return record.levelno > logging.WARNING
+
+    loggers = (logging.root, logging.getLogger("lerobot.datasets.utils"))
+    for each in loggers:
+        each.addFilter(worse)
+    try:
+        yield
+    finally:
+        for each in loggers:
+            each.removeFilter(worse)

@@ -1,4 +1,7 @@
-"""The source's own pictures of one episode: cut out of its files, decoded once, with their statistics."""
+"""Recorded pictures for the output, not encoded again: one episode cut out of the source's files and checked.
+
+The counterpart of `encode`, which takes rendered pictures.
+"""
 
 from pathlib import Path
 

@@ -1,4 +1,7 @@
-"""The pictures of one new episode, encoded as they are drawn, all cameras in step, and read again before they count."""
+"""Rendered pictures for the output: encoded as they come, all cameras in step, and read again before they count.
+
+The counterpart of `copy_source`, which takes recorded pictures.
+"""
 
 import shutil
 from collections import deque
@@ -12,9 +15,10 @@ import numpy as np
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.datasets.compute_stats import auto_downsample_height_width, get_feature_stats, sample_indices
 
-from lerobot_msdyn.core.errors import OutputError
+from lerobot_msdyn.core.errors import EpisodeError, OutputError
 from lerobot_msdyn.core.files import writing
-from lerobot_msdyn.dataset.read import depth_units_per_metre, encode_image, picture_channels
+from lerobot_msdyn.dataset.checks import picture_size
+from lerobot_msdyn.dataset.read import depth_units_per_metre
 from lerobot_msdyn.dataset.video import VideoFile, encoder_of, nvenc_of, problem_of
 
 Stats = dict[str, dict[str, np.ndarray]]
@@ -100,7 +104,7 @@ class _FeatureWriter:
     def __init__(self, source: LeRobotDatasetMetadata, key: str, folder: Path, length: int, *, nvenc: bool) -> None:
         self._unit = depth_units_per_metre(source, key)
         self._is_depth = key in source.depth_keys
-        self._channels = picture_channels(source, key)
+        self._channels = picture_size(source.features[key])[2]
         self._wanted = set(sample_indices(length))
         self._samples: list[np.ndarray] = []
         self._levels: list[float] = []
@@ -147,6 +151,16 @@ class _FeatureWriter:
 
     def stats(self) -> dict[str, np.ndarray]:
         return image_stats(np.stack(self._samples), 1.0 if self._is_depth else 255.0)
+
+
+def encode_image(image: np.ndarray, suffix: str) -> bytes:
+    """An image file's content: colours uint8 [h,w,3] or [h,w,4], or grey or depth [h,w] as it is stored."""
+    if image.ndim == 3:
+        image = cv2.cvtColor(image, cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA)
+    ok, content = cv2.imencode(suffix, image)
+    if not ok:
+        raise EpisodeError(f"an image of shape {image.shape} cannot be encoded as {suffix}")
+    return bytes(content.tobytes())
 
 
 def with_channels(picture: np.ndarray, channels: int) -> np.ndarray:

@@ -1,7 +1,8 @@
-"""Which episodes of a dataset show the same recording, also after other tools have merged, cut or renumbered it.
+"""Which episodes of any dataset show the same recording, found by their content.
 
+So it holds also after other tools have merged, cut or renumbered a dataset, or lost the record that `provenance` wrote.
 Re-rendered episodes have their source's rows bit for bit. So episodes whose recorded numbers (states, actions, times,
-...) are the same belong together, whatever became of meta/msdyn on the way; where it is there, it has its say as well.
+...) are the same belong together, whatever became of meta/msdyn/ on the way; where that is there, it counts as well.
 """
 
 import hashlib

@@ -1,4 +1,7 @@
-"""What made each episode of an output dataset, kept in its meta/msdyn/."""
+"""The record of an output dataset, meta/msdyn/: from which recording each episode comes, and what made it.
+
+`lineage` finds out the same of any dataset, also where this record was lost.
+"""
 
 import hashlib
 import importlib.metadata

@@ -20,10 +20,10 @@ from lerobot.datasets.video_utils import decode_video_frames
 from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, OBS_STATE
 from torch import Tensor
 
-from lerobot_msdyn.core.cameras import CameraTrack, intrinsics_from_fov, read_calibration, static_camera
 from lerobot_msdyn.core.config import CameraConfig
 from lerobot_msdyn.core.errors import DatasetError, EpisodeError, first_line
 from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.dataset.calibration import make_camera
 from lerobot_msdyn.dataset.checks import check_metadata, picture_size, read_json
 from lerobot_msdyn.dataset.chroma import is_subsampled, restore_chroma
 from lerobot_msdyn.dataset.rows import TIMESTAMP_TOLERANCE_S, read_rows, source_file, task_of
@@ -34,7 +34,6 @@ CODEBASE_VERSION = "v3.0"
 VIDEO_ERRORS = (av.FFmpegError, OSError, ValueError, RuntimeError, IndexError, AttributeError)
 BLOCK_FRAMES = 128  # that are decoded at once
 MILLIMETRES = 1000.0
-ON_ROBOT = ("wrist", "hand", "gripper", "palm", "finger", "effector", "flange", "tool")  # in names of cameras
 
 
 @dataclass(frozen=True)
@@ -112,63 +111,6 @@ def check_version(root: Path) -> None:
         raise DatasetError(f"{root} is a LeRobot dataset of version {version}; expected {CODEBASE_VERSION}; {todo}")
 
 
-def select_episodes(meta: LeRobotDatasetMetadata, episodes: list[int] | None) -> list[int]:
-    """The episodes asked for, each once and in order; all of them if none are named.
-
-    Raises:
-        DatasetError: an index is out of range.
-    """
-    if episodes is None:
-        return list(range(meta.total_episodes))
-    bad = [index for index in episodes if not 0 <= index < meta.total_episodes]
-    if bad:
-        raise DatasetError(
-            f"{meta.repo_id}: no episode {', '.join(map(str, bad))}; "
-            f"it has {meta.total_episodes} (0 to {meta.total_episodes - 1})"
-        )
-    return sorted(set(episodes))
-
-
-def colour_cameras(meta: LeRobotDatasetMetadata) -> list[str]:
-    """Feature keys of the colour cameras."""
-    return [key for key in meta.camera_keys if key not in meta.depth_keys]
-
-
-def select_cameras(meta: LeRobotDatasetMetadata, cameras: list[str] | None, *, allow_moving: bool = False) -> list[str]:
-    """The cameras to re-render: those asked for (by key or its last part), else all that are not on the robot.
-
-    Raises:
-        DatasetError: a name is unknown or of a camera on the robot, or no camera is left.
-    """
-    known = colour_cameras(meta)
-    if cameras is None:
-        chosen = [key for key in known if allow_moving or not is_wrist_camera(key)]
-        if not chosen:
-            raise DatasetError(
-                f"{meta.repo_id}: no camera to re-render; its colour cameras are {', '.join(known) or 'none'}"
-            )
-        return chosen
-    chosen = []
-    for name in cameras:
-        matches = [key for key in known if name in (key, key.rsplit(".", 1)[-1])]
-        if not matches:
-            raise DatasetError(f"{meta.repo_id}: no colour camera {name!r}; it has {', '.join(known) or 'none'}")
-        chosen += [key for key in matches if key not in chosen]
-    on_robot = [key for key in chosen if is_wrist_camera(key)]
-    if on_robot and not allow_moving:
-        raise DatasetError(
-            f"{meta.repo_id}: {', '.join(on_robot)} moves with the robot, by its name: its picture is tied to the "
-            "state, and would belong to another one; leave it out, or allow it by --allow_moving"
-        )
-    return chosen
-
-
-def is_wrist_camera(key: str) -> bool:
-    """Whether a camera's name says that it moves with the robot."""
-    name = key.rsplit(".", 1)[-1].lower()
-    return any(word in name for word in ON_ROBOT)
-
-
 def read_episode(
     meta: LeRobotDatasetMetadata, index: int, cameras: list[str], config: CameraConfig, *, recorded_depth: bool = True
 ) -> Episode:
@@ -203,16 +145,6 @@ def read_episode(
         action=_matrix(rows, ACTION),
         task=task_of(meta, rows),
     )
-
-
-def make_camera(key: str, index: int, rgb: UInt8[Tensor, "t h w 3"], config: CameraConfig) -> CameraTrack:
-    """The calibrated camera, or a fixed one with the configured field of view."""
-    frames, height, width = rgb.shape[:3]
-    if config.calibration is not None:
-        camera = read_calibration(config.calibration, key, index, frames, width, height)
-        if camera is not None:
-            return camera
-    return static_camera(intrinsics_from_fov(width, height, config.horizontal_fov_deg), frames, width, height)
 
 
 def depth_key_of(meta: LeRobotDatasetMetadata, camera: str) -> str | None:
@@ -344,21 +276,6 @@ def _decode_image(meta: LeRobotDatasetMetadata, index: int, key: str, item: Any,
     if image is None:
         raise EpisodeError(f"{where}: an image of {len(content)} bytes cannot be decoded")
     return image
-
-
-def picture_channels(meta: LeRobotDatasetMetadata, key: str) -> int:
-    """How many channels a picture feature has: 1, 3 or 4."""
-    return picture_size(meta.features[key])[2]
-
-
-def encode_image(image: np.ndarray, suffix: str) -> bytes:
-    """An image file's content: colours uint8 [h,w,3] or [h,w,4], or grey or depth [h,w] as it is stored."""
-    if image.ndim == 3:
-        image = cv2.cvtColor(image, cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA)
-    ok, content = cv2.imencode(suffix, image)
-    if not ok:
-        raise EpisodeError(f"an image of shape {image.shape} cannot be encoded as {suffix}")
-    return bytes(content.tobytes())
 
 
 def depth_units_per_metre(meta: LeRobotDatasetMetadata, key: str) -> float:

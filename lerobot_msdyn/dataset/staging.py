@@ -39,6 +39,7 @@ SCENE = "scene"
 PUBLISHED = "published.json"
 WORTH_KEEPING = (SCENE, "variant", FINISHED)  # what takes long to make
 MAX_NAMED = 5  # differences that a message lists
+CODE_CHANGED = "the code of lerobot_msdyn has changed"
 
 
 def work_folder(root: Path) -> Path:
@@ -154,12 +155,7 @@ class Staging(Kept):
             before = self._read(path)
             changes = differences(before, run)
             if changes:
-                more = f", and {len(changes) - MAX_NAMED} more" if len(changes) > MAX_NAMED else ""
-                raise OutputError(
-                    f"{self.folder} holds an unfinished run that was started differently: "
-                    f"{'; '.join(changes[:MAX_NAMED])}{more}. Start it as before to go on, add --restart to throw away "
-                    "what it holds, or choose another --new_repo_id"
-                )
+                raise OutputError(f"{self.folder} holds an unfinished run that {_how_to_go_on(changes)}")
             logger.info("going on with the unfinished run in %s: %d episodes are done", self.folder, self.finished())
             return
         self.clear()
@@ -205,6 +201,20 @@ def published_before(root: Path) -> list[str] | None:
     return [str(line) for line in skipped]
 
 
+def _how_to_go_on(changes: list[str]) -> str:
+    """What to do about a run that differs from the one that was begun."""
+    more = f", and {len(changes) - MAX_NAMED} more" if len(changes) > MAX_NAMED else ""
+    listed = "; ".join(sorted(changes, key=lambda change: change != CODE_CHANGED)[:MAX_NAMED])
+    anew = "add --restart to throw away what it holds and begin anew, or choose another --new_repo_id"
+    if changes == [CODE_CHANGED]:
+        return (
+            "another version of lerobot_msdyn began: the package's code has changed since, and one dataset must not "
+            f"hold the results of both. Go on with the version that began it, {anew}"
+        )
+    code = ", with the version of lerobot_msdyn that began it" if CODE_CHANGED in changes else ""
+    return f"was started differently: {listed}{more}. Start it as before{code} to go on, {anew}"
+
+
 def differences(before: Any, now: Any, name: str = "") -> list[str]:
     """One line per value that differs between two nested dictionaries: its dotted name, the old and the new value."""
     if isinstance(before, dict) and isinstance(now, dict):
@@ -215,6 +225,8 @@ def differences(before: Any, now: Any, name: str = "") -> list[str]:
         return lines
     if before == now:
         return []
+    if name == "versions.code":  # a digest, which says nothing to a reader
+        return [CODE_CHANGED]
     if name.startswith("source: "):
         state = "is new" if before is None else "is gone" if now in (None, "absent") else "has changed"
         return [f"{name} {state}"]

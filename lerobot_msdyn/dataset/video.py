@@ -1,9 +1,10 @@
 """Video files: encode frames as the source was encoded, and cut an episode out of a shared file without loss."""
 
+import contextlib
 import logging
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from functools import cache
@@ -24,13 +25,30 @@ from lerobot_msdyn.dataset.rows import TIMESTAMP_TOLERANCE_S
 logger = logging.getLogger(__name__)
 
 NVENC = {"h264": "h264_nvenc", "hevc": "hevc_nvenc"}  # LeRobot's encoders: on the processor, and on an NVIDIA GPU
+SVT_LOG, SVT_ERRORS = "SVT_LOG", "1"  # how much the AV1 encoder writes to stderr; read when it is opened
 MAX_LEVEL_ERROR = 16  # of 255; coding changes a frame's mean brightness by less than 2, an empty frame by more
 
 
 def quiet_encoders() -> None:
-    """FFmpeg and the AV1 encoder write to stderr past every logger; what goes wrong is raised as well."""
+    """FFmpeg and the AV1 encoder write to stderr past every logger; what goes wrong is raised as well.
+
+    For the rest of the process, so for commands only.
+    """
     av.logging.set_libav_level(av.logging.FATAL)
-    os.environ.setdefault("SVT_LOG", "1")
+    os.environ.setdefault(SVT_LOG, SVT_ERRORS)
+
+
+@contextlib.contextmanager
+def quiet_av1() -> Iterator[None]:
+    """An AV1 encoder that is opened here says nothing but errors, unless the user has set SVT_LOG."""
+    if SVT_LOG in os.environ:
+        yield
+        return
+    os.environ[SVT_LOG] = SVT_ERRORS
+    try:
+        yield
+    finally:
+        os.environ.pop(SVT_LOG, None)
 
 
 def frame_rate(fps: int | float) -> Fraction:
@@ -81,7 +99,6 @@ class VideoFile:
     """An mp4 file that grows frame by frame, encoded as the source was."""
 
     def __init__(self, path: Path, fps: int | float, encoder: RGBEncoderConfig | DepthEncoderConfig) -> None:
-        quiet_encoders()
         path.parent.mkdir(parents=True, exist_ok=True)
         self._rate, self._encoder = frame_rate(fps), encoder
         self._container = av.open(str(path), "w")
@@ -107,7 +124,9 @@ class VideoFile:
             self._stream.width, self._stream.height = frame.width, frame.height
         frame.pts = self._count
         frame.time_base = 1 / self._rate
-        self._container.mux(self._stream.encode(frame))
+        with contextlib.nullcontext() if self._count else quiet_av1():  # the first frame opens the encoder
+            packets = self._stream.encode(frame)
+        self._container.mux(packets)
         self._count += 1
 
     def close(self) -> None:

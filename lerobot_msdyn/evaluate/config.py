@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from lerobot_msdyn.core.config import Recipe
-from lerobot_msdyn.core.fields import between
+from lerobot_msdyn.core.fields import MAX_INDEX, between
 
 # Named: draccus finds the comment above a field only where its annotation holds no quotes.
 Protocol = Literal["som", "dycheck"]
@@ -44,7 +44,7 @@ class HeldoutCameraConfig(Recipe):
     # Exact folder of the source dataset; default: LeRobot's home, then the hub.
     root: Path | None = None
     # The episode.
-    episode: int = between(0, 0, 1_000_000_000)
+    episode: int = between(0, 0, MAX_INDEX)
     # The camera that is fitted, by feature key or its last part.
     train_camera: str = ""
     # The camera that is compared with; it is not fitted.

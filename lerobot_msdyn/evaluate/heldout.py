@@ -12,7 +12,8 @@ from numpy import ndarray
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.core.observations import View
-from lerobot_msdyn.dataset.read import Episode, colour_cameras, open_source, read_episode, select_cameras
+from lerobot_msdyn.dataset.read import Episode, open_source, read_episode
+from lerobot_msdyn.dataset.select import colour_cameras, select_cameras
 from lerobot_msdyn.evaluate.colour import fit_colours
 from lerobot_msdyn.evaluate.config import HeldoutCameraConfig
 from lerobot_msdyn.evaluate.perceptual import without_flip

@@ -18,7 +18,8 @@ from numpy import ndarray
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.errors import DatasetError
 from lerobot_msdyn.core.observations import View
-from lerobot_msdyn.dataset.read import open_source, read_episode, select_cameras
+from lerobot_msdyn.dataset.read import open_source, read_episode
+from lerobot_msdyn.dataset.select import select_cameras
 from lerobot_msdyn.evaluate.config import EvaluateConfig
 from lerobot_msdyn.evaluate.perceptual import without_flip
 from lerobot_msdyn.evaluate.scores import Evaluated, Scores, TrueViews, mean_scores, score_table, score_views

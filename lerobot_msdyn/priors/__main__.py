@@ -48,7 +48,8 @@ def run(arguments: list[str]) -> int:
     for name, given in (("repo", config.repo_id != ""), ("out", config.out != Path())):
         if not given:
             raise ConfigError(f"--{name} is missing; expected: {COMMAND} --repo NAME [--root FOLDER] --out DIR")
-    from lerobot_msdyn.dataset.read import open_source, read_episode, select_cameras, select_episodes
+    from lerobot_msdyn.dataset.read import open_source, read_episode
+    from lerobot_msdyn.dataset.select import select_cameras, select_episodes
 
     source = open_source(config.repo_id, config.root)
     cameras = select_cameras(source, config.cameras)

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 from lerobot_msdyn.core.errors import MsdynError
+from lerobot_msdyn.dataset.video import quiet_encoders
 from lerobot_msdyn.synthetic.choreography import KINDS
 from lerobot_msdyn.synthetic.dataset import write_dataset
 from lerobot_msdyn.synthetic.iphone import write_iphone_folder
@@ -45,6 +46,7 @@ def _parser() -> argparse.ArgumentParser:
 def main(arguments: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
+    quiet_encoders()
     a = _parser().parse_args(arguments)
     try:
         count = a.episodes if a.layout == "dataset" else 1

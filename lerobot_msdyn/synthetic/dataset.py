@@ -83,9 +83,8 @@ def record(
     from lerobot.configs import DepthEncoderConfig
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from lerobot_msdyn.dataset.video import quiet_encoders
+    from lerobot_msdyn.dataset.video import quiet_av1
 
-    quiet_encoders()
     if root.exists():
         raise OutputError(f"{root} exists already; remove it or choose another folder for the synthetic dataset")
     dataset = LeRobotDataset.create(
@@ -102,8 +101,9 @@ def record(
     for scene, views in episodes:
         for t in range(len(scene)):
             dataset.add_frame(_frame(scene, views, features, t))
-        # one process: forking beside the ray-caster's threads can hang
-        dataset.save_episode(parallel_encoding=False)
+        with quiet_av1():
+            # one process: forking beside the ray-caster's threads can hang
+            dataset.save_episode(parallel_encoding=False)
     dataset.finalize()
 
 

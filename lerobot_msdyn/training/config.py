@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_msdyn.core.fields import INFINITY, between
+from lerobot_msdyn.core.fields import INFINITY, MAX_SEED, between
 
 
 @dataclass
@@ -17,6 +17,6 @@ class MixedViewsConfig:
     # A recipe, by file or name, whose perturbation is used; default: the one of the run that saved the scenes.
     perturbation: str | None = None
     # Seed of every random choice; together with the epoch and the sample's index it fixes the result.
-    seed: int = between(0, 0, 4_294_967_295)
+    seed: int = between(0, 0, MAX_SEED)
     # Memory for the scenes that are kept loaded, in MB, in each data loading worker.
     memory_mb: float = between(1024.0, 0, INFINITY)

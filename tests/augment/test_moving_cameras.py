@@ -4,13 +4,16 @@ from pathlib import Path
 
 import pytest
 import torch
+from lerobot.datasets import LeRobotDatasetMetadata
 
+from lerobot_msdyn.augment import moving_cameras
 from lerobot_msdyn.augment.moving_cameras import correlation, still_cameras, why_moving
 from lerobot_msdyn.core.cameras import intrinsics_from_fov, static_camera
 from lerobot_msdyn.core.config import Recipe
-from lerobot_msdyn.core.errors import DatasetError
+from lerobot_msdyn.core.errors import DatasetError, EpisodeError
 from lerobot_msdyn.core.observations import View
-from lerobot_msdyn.dataset.read import Episode, EpisodeSource, is_wrist_camera, open_source, select_cameras
+from lerobot_msdyn.dataset.read import Episode, EpisodeSource, open_source
+from lerobot_msdyn.dataset.select import select_cameras
 
 FRAMES, WIDTH, HEIGHT = 60, 160, 120
 
@@ -46,27 +49,34 @@ def test_a_camera_that_stands_or_moves_by_itself_is_not_refused() -> None:
     assert why_moving(episode(2 * torch.arange(FRAMES), path[:, None]), "top") == ""
 
 
-@pytest.mark.parametrize("name", ["wrist", "left_hand", "gripper_cam", "eye_in_hand", "end_effector", "tool0"])
-def test_names_of_cameras_on_the_robot(name: str) -> None:
-    assert is_wrist_camera(f"observation.images.{name}")
-
-
-@pytest.mark.parametrize("name", ["front", "top", "overhead", "side", "laptop"])
-def test_names_of_cameras_beside_the_robot(name: str) -> None:
-    assert not is_wrist_camera(f"observation.images.{name}")
-
-
-def test_a_wrist_camera_is_rendered_only_where_that_is_allowed(image_desk: Path) -> None:
-    source = open_source("local/desk", image_desk)
-    wrist = "observation.images.wrist"
-    assert wrist not in select_cameras(source, None)
-    with pytest.raises(DatasetError, match=r"wrist moves with the robot, by its name.*--allow_moving"):
-        select_cameras(source, ["wrist"])
-    assert select_cameras(source, ["wrist"], allow_moving=True) == [wrist]
-    assert wrist in select_cameras(source, None, allow_moving=True)
-
-
 def test_cameras_on_stands_are_kept(desk: Path) -> None:
     source = open_source("local/desk", desk)
     cameras = select_cameras(source, None)
-    assert still_cameras(source, 0, cameras, Recipe()) == cameras
+    assert still_cameras(source, [0], cameras, Recipe()) == cameras
+
+
+@pytest.fixture
+def on_the_arm(desk: Path, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Episode 0 of `desk` cannot be read, and all cameras move with the robot; the episodes that were asked for."""
+    asked: list[int] = []
+
+    def read(source: LeRobotDatasetMetadata, index: int, *rest: object, **more: object) -> Episode:
+        asked.append(index)
+        if index == 0:
+            raise EpisodeError("local/desk episode 0: it is damaged")
+        return episode(stop_and_go().round(), stop_and_go()[:, None])
+
+    monkeypatch.setattr(moving_cameras, "read_episode", read)
+    return asked
+
+
+def test_an_episode_that_cannot_be_read_lets_no_camera_pass(desk: Path, on_the_arm: list[int]) -> None:
+    source = open_source("local/desk", desk)
+    with pytest.raises(DatasetError, match=r"top is refused: its background moves.*with the robot"):
+        still_cameras(source, [0, 1, 2], ["top"], Recipe())
+    assert on_the_arm == [0, 1]
+
+
+def test_where_no_episode_can_be_read_no_camera_passes(desk: Path, on_the_arm: list[int]) -> None:
+    with pytest.raises(EpisodeError, match=r"none of 1 episodes can be read.*First: .*episode 0: it is damaged"):
+        still_cameras(open_source("local/desk", desk), [0], ["top"], Recipe())

@@ -1,23 +1,31 @@
 """Recipes and flags: what they set, and what is refused."""
 
+import ast
 import dataclasses
+import importlib
+import itertools
 import re
 import subprocess
 import sys
+import typing
 from pathlib import Path
+from typing import Any
 
+import draccus
 import pytest
 import yaml
 
 from lerobot_msdyn.augment.config import AugmentConfig
-from lerobot_msdyn.core import config as config_module
-from lerobot_msdyn.core.cli import format_help, parse_config, read_recipe, recipe_folder
+from lerobot_msdyn.core.cli import format_help, parse_config
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import ConfigError
+from lerobot_msdyn.core.fields import problems
+from lerobot_msdyn.core.recipe_files import read_recipe, recipe_folder
 from lerobot_msdyn.views.perturbations.jitter import Jitter
 from lerobot_msdyn.views.perturbations.orbit import Orbit
 
 PROJECT = Path(__file__).parents[2]
+PACKAGE = PROJECT / "lerobot_msdyn"
 RECIPES = sorted((PROJECT / "recipes").rglob("*.yaml"))
 
 
@@ -122,34 +130,106 @@ def test_recipe_is_valid_and_says_how_it_is_used(path: Path) -> None:
     assert set(yaml.safe_load(text)) <= {field.name for field in dataclasses.fields(Recipe)}
 
 
-def config_classes() -> list[type]:
-    return [
-        item
-        for item in vars(config_module).values()
-        if dataclasses.is_dataclass(item) and isinstance(item, type) and item.__module__ == config_module.__name__
-    ]
+COMMANDS = {  # what each command line sets
+    "augment": "AugmentConfig",
+    "evaluate nvs": "EvaluateConfig",
+    "evaluate dycheck": "DycheckConfig",
+    "evaluate heldout-camera": "HeldoutCameraConfig",
+    "priors": "PriorsCommandConfig",
+    "split": "SplitConfig",
+    "carry": "CarryConfig",
+    "viewer": "ViewerConfig",
+    "training.plugin": "MixedViewsConfig",
+}
+
+
+def command_configs() -> dict[str, type]:
+    """By name, every dataclass of the package that is called a Config, wherever it stands, and Recipe."""
+    found = {}
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ClassDef) and (node.name.endswith("Config") or node.name == "Recipe"):
+                module = ".".join(path.relative_to(PROJECT).with_suffix("").parts).removesuffix(".__init__")
+                found[node.name] = getattr(importlib.import_module(module), node.name)
+    return {name: kind for name, kind in found.items() if dataclasses.is_dataclass(kind)}
+
+
+def with_parts(kind: Any) -> set[type]:
+    """A config class, those of its fields, and the choices that these have."""
+    classes = {kind}
+    for hint in typing.get_type_hints(kind).values():
+        if isinstance(hint, type) and dataclasses.is_dataclass(hint):
+            classes |= with_parts(hint)
+            if issubclass(hint, draccus.ChoiceRegistry):
+                choices: Any = hint
+                classes |= {part for choice in choices.get_known_choices().values() for part in with_parts(choice)}
+    return classes
+
+
+CONFIGS = command_configs()
+ALL_CLASSES = sorted({part for kind in CONFIGS.values() for part in with_parts(kind)}, key=lambda kind: kind.__name__)
+
+
+def test_the_configs_of_all_commands_are_looked_at() -> None:
+    assert set(COMMANDS.values()) <= set(CONFIGS)
+    names = {kind.__name__ for kind in ALL_CLASSES}
+    assert {"Recipe", "FitConfig", "FramesPerKnot", "Orbit", "Drift"} <= names
 
 
 def test_every_field_is_read_somewhere() -> None:
-    code = "\n".join(
-        path.read_text()
-        for path in (PROJECT / "lerobot_msdyn").rglob("*.py")
-        if path.name not in ("config.py", "cli.py")
-    )
+    code = "\n".join(path.read_text() for path in PACKAGE.rglob("*.py") if path.name not in ("config.py", "cli.py"))
     unread = [
         f"{kind.__name__}.{field.name}"
-        for kind in config_classes()
+        for kind in ALL_CLASSES
         for field in dataclasses.fields(kind)
         if not re.search(rf"\.{field.name}\b|\"{field.name}\"", code)
     ]
     assert unread == []
 
 
-def test_every_field_is_explained_in_the_help() -> None:
-    text = format_help(AugmentConfig, {"repo": "repo_id"}, "augment")
-    for line, following in zip(text.splitlines(), text.splitlines()[1:], strict=False):
-        if line.startswith("  --"):
-            assert following.strip(), line
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_field_is_explained_in_the_help(command: str) -> None:
+    kind = CONFIGS[COMMANDS[command]]
+    lines = format_help(kind, {}, command).splitlines()
+    explained = {
+        line.split()[0]
+        for line, following in itertools.pairwise(lines)
+        if line.startswith("  --") and following.startswith("      ") and following.strip()
+    }
+    unexplained = {line.split()[0] for line in lines if line.startswith("  --")} - explained
+    assert unexplained == set()
+    assert {f"--{field.name}" for field in dataclasses.fields(kind)} <= {
+        flag if flag.startswith("--") else f"--{flag.rstrip(':')}"
+        for flag in [line.split()[0].split(".")[0] for line in lines if line.strip()]
+    }
+
+
+@pytest.mark.parametrize("kind", ALL_CLASSES, ids=lambda kind: kind.__name__)
+def test_every_number_has_a_range_and_a_default_inside_it(kind: Any) -> None:
+    hints = typing.get_type_hints(kind)
+    numbers = [field for field in dataclasses.fields(kind) if hints[field.name] in (int, float)]
+    assert [field.name for field in numbers if "range" not in field.metadata] == []
+    needed = [line for line in problems(kind()) if " is empty; expected" in line]  # poses, and another camera's name
+    assert problems(kind()) == needed
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        ("AugmentConfig", ["--workers", "-1"], "workers is -1; expected a value from 0"),
+        ("AugmentConfig", ["--seed", "-1"], "seed is -1; expected a value from 0"),
+        ("SplitConfig", ["--eval_split", "0"], "eval_split is 0.0; expected a value from 1e-06 to 0.999999"),
+        ("SplitConfig", ["--eval_split", "1"], "eval_split is 1.0"),
+        ("SplitConfig", ["--eval_split", ".nan"], "eval_split is nan"),
+        ("ViewerConfig", ["--episode", "-1"], "episode is -1; expected a value from 0"),
+        ("HeldoutCameraConfig", ["--episode", "-1"], "episode is -1"),
+        ("MixedViewsConfig", ["--probability", "1.5"], "probability is 1.5; expected a value from 0 to 1"),
+        ("PriorsCommandConfig", ["--columns", "0"], "columns is 0"),
+    ],
+)
+def test_a_number_out_of_range_is_refused_by_every_command(name: str, arguments: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        parse_config(CONFIGS[name], arguments, {}, command=name)
 
 
 def test_help_answers_without_importing_torch() -> None:

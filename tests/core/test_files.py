@@ -2,12 +2,13 @@
 
 import errno
 import os
+import tempfile
 from pathlib import Path
 
 import pytest
 
 from lerobot_msdyn.core.errors import OutputError
-from lerobot_msdyn.core.files import digest_of_file, whole_file, write_whole, writing
+from lerobot_msdyn.core.files import digest_of_file, temporary_files_in, whole_file, write_whole, writing
 
 
 def test_a_file_is_replaced_or_left(tmp_path: Path) -> None:
@@ -32,6 +33,19 @@ def test_a_full_disk_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"x cannot be written \(No space left on device\); what is finished is kept"):  # noqa: SIM117
         with writing(tmp_path / "x"):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_temporary_files_go_elsewhere_only_for_the_time(tmp_path: Path) -> None:
+    before = tempfile.gettempdir()
+
+    def fail() -> None:
+        with temporary_files_in(tmp_path):
+            assert Path(tempfile.mkdtemp()).is_relative_to(tmp_path)
+            raise RuntimeError("stopped")
+
+    with pytest.raises(RuntimeError, match="stopped"):
+        fail()
+    assert tempfile.gettempdir() == before
 
 
 def test_digests(tmp_path: Path) -> None:

@@ -1,14 +1,18 @@
 """Datasets of version v2.1 are converted in a copy."""
 
 import json
+import logging
 from pathlib import Path
 
 import pytest
 import torch
 
 from lerobot_msdyn.core.errors import DatasetError
+from lerobot_msdyn.dataset import convert
 from lerobot_msdyn.dataset.convert import converted_copy
-from lerobot_msdyn.dataset.read import colour_cameras, open_source, read_colour, read_rows
+from lerobot_msdyn.dataset.read import open_source, read_colour
+from lerobot_msdyn.dataset.rows import read_rows
+from lerobot_msdyn.dataset.select import colour_cameras
 
 
 def legacy(root: Path, **changes: object) -> Path:
@@ -37,6 +41,23 @@ def test_a_link_out_of_the_source_is_not_followed(tmp_path: Path) -> None:
     (root / "meta" / "tasks.jsonl").symlink_to(tmp_path / "secret")
     with pytest.raises(DatasetError, match="outside of it"):
         converted_copy("local/a", root, tmp_path / "work")
+
+
+def test_only_lerobot_is_quiet_and_only_while_it_converts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def chatty(repo_id: str, root: Path, push_to_hub: bool) -> None:
+        logging.info("a line per file")
+        logging.getLogger("lerobot.datasets.utils").warning("a line per field")
+        logging.getLogger("of_the_user").warning("wait")
+        logging.error("trouble")
+
+    monkeypatch.setattr(convert, "convert_dataset", chatty)
+    with caplog.at_level("INFO"):
+        converted_copy("local/a", legacy(tmp_path / "a"), tmp_path / "work")
+        logging.getLogger("lerobot.datasets.utils").warning("later")
+    said = [record.getMessage() for record in caplog.records if record.name != convert.__name__]
+    assert said == ["wait", "trouble", "later"]
 
 
 @pytest.mark.slow

@@ -18,8 +18,10 @@ from lerobot.datasets.language import (
 )
 
 from lerobot_msdyn.core.config import CameraConfig
+from lerobot_msdyn.dataset.encode import encode_image
 from lerobot_msdyn.dataset.provenance import SOURCE_VARIANT, Provenance
-from lerobot_msdyn.dataset.read import encode_image, open_source, read_colour, read_episode, read_rows
+from lerobot_msdyn.dataset.read import open_source, read_colour, read_episode
+from lerobot_msdyn.dataset.rows import read_rows
 from lerobot_msdyn.dataset.write import NewEpisode, OutputDataset
 
 FRONT, SIDE = "observation.images.front", "observation.images.side"

@@ -11,7 +11,7 @@ from lerobot.datasets import LeRobotDataset
 from lerobot_msdyn.core.config import CameraConfig
 from lerobot_msdyn.core.errors import DatasetError, EpisodeError
 from lerobot_msdyn.dataset.chroma import restore_chroma
-from lerobot_msdyn.dataset.read import open_source, read_episode, select_cameras, select_episodes
+from lerobot_msdyn.dataset.read import open_source, read_episode
 
 FRONT, SIDE = "observation.images.front", "observation.images.side"
 
@@ -47,25 +47,6 @@ def test_an_image_dataset_is_read_too(image_desk: Path) -> None:
 def test_depth_is_left_out_on_request(desk: Path) -> None:
     episode = read_episode(open_source("local/desk", desk), 0, [FRONT], CameraConfig(), recorded_depth=False)
     assert episode.views[FRONT].depth is None
-
-
-def test_cameras_by_key_or_last_part_and_never_the_wrist(desk: Path, image_desk: Path) -> None:
-    source = open_source("local/desk", desk)
-    assert select_cameras(source, None) == [FRONT, SIDE]
-    assert select_cameras(source, ["side"]) == [SIDE]
-    assert select_cameras(open_source("local/desk", image_desk), None) == [FRONT]
-    with pytest.raises(DatasetError, match=r"no colour camera 'top'; it has .*front.*side"):
-        select_cameras(source, ["top"])
-    with pytest.raises(DatasetError, match="front_depth"):
-        select_cameras(source, ["front_depth"])
-
-
-def test_episode_out_of_range(desk: Path) -> None:
-    source = open_source("local/desk", desk)
-    assert select_episodes(source, None) == [0, 1, 2]
-    assert select_episodes(source, [2, 0, 2]) == [0, 2]
-    with pytest.raises(DatasetError, match=r"no episode 3, -1; it has 3 \(0 to 2\)"):
-        select_episodes(source, [0, 3, -1])
 
 
 def test_no_such_dataset(tmp_path: Path) -> None:

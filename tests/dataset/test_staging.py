@@ -59,6 +59,23 @@ def test_another_run_is_named_and_not_mixed_in(tmp_path: Path) -> None:
         staging.agree(other)
 
 
+CODE = "the code of lerobot_msdyn has changed"
+
+
+def test_a_run_of_other_code_is_told_in_plain_words(tmp_path: Path) -> None:
+    with Staging(tmp_path / "out") as staging:
+        staging.agree(RUN | {"versions": {"code": "0a1b"}})
+        staging.episode(0).keep(FINISHED, lambda: 1)
+    with Staging(tmp_path / "out") as staging:
+        with pytest.raises(OutputError, match=r"code has changed since.*Go on with the version.*--restart") as caught:
+            staging.agree(RUN | {"versions": {"code": "2c3d"}})
+        assert "0a1b" not in str(caught.value)
+        changed = {"recipe": {"variants": 3}, "source": {f"data/{i}": "c" for i in range(9)}, "versions": {"code": "2"}}
+        with pytest.raises(OutputError, match=rf"differently: {CODE}; .*as before, with the version of lerobot_msdyn"):
+            staging.agree(changed)
+        assert staging.finished() == 1
+
+
 def test_one_run_at_a_time(tmp_path: Path) -> None:
     with Staging(tmp_path / "out"), pytest.raises(OutputError, match=r"out is being written by process \d+ on "):
         Staging(tmp_path / "out")

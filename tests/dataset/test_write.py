@@ -11,7 +11,8 @@ from lerobot.datasets import LeRobotDataset
 from lerobot_msdyn.core.errors import OutputError
 from lerobot_msdyn.dataset.encode import image_stats
 from lerobot_msdyn.dataset.provenance import SOURCE_VARIANT, Provenance
-from lerobot_msdyn.dataset.read import open_source, read_colour, read_depth, read_rows
+from lerobot_msdyn.dataset.read import open_source, read_colour, read_depth
+from lerobot_msdyn.dataset.rows import read_rows
 from lerobot_msdyn.dataset.write import NewEpisode, OutputDataset
 
 FRONT = "observation.images.front"

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from lerobot_msdyn.core.cli import run_command
-from lerobot_msdyn.dataset.read import open_source, read_colour, read_rows
+from lerobot_msdyn.dataset.read import open_source, read_colour
+from lerobot_msdyn.dataset.rows import read_rows
 from lerobot_msdyn.evaluate import __main__ as evaluate
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.nvs import write_nvs_folder

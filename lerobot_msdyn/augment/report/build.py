@@ -23,7 +23,8 @@ from lerobot_msdyn.augment.report.pictures import (
     strip,
 )
 from lerobot_msdyn.dataset.provenance import SOURCE_VARIANT
-from lerobot_msdyn.dataset.read import open_source, read_colour, read_rows
+from lerobot_msdyn.dataset.read import open_source, read_colour
+from lerobot_msdyn.dataset.rows import read_rows
 from lerobot_msdyn.dataset.write import NewEpisode
 
 logger = logging.getLogger(__name__)

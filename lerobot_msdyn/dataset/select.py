@@ -1,0 +1,64 @@
+"""Which episodes and cameras of a dataset are worked on: those asked for, or all that may be re-rendered."""
+
+from lerobot.datasets import LeRobotDatasetMetadata
+
+from lerobot_msdyn.core.errors import DatasetError
+
+ON_ROBOT = ("wrist", "hand", "gripper", "palm", "finger", "effector", "flange", "tool")  # in names of cameras
+
+
+def select_episodes(meta: LeRobotDatasetMetadata, episodes: list[int] | None) -> list[int]:
+    """The episodes asked for, each once and in order; all of them if none are named.
+
+    Raises:
+        DatasetError: an index is out of range.
+    """
+    if episodes is None:
+        return list(range(meta.total_episodes))
+    bad = [index for index in episodes if not 0 <= index < meta.total_episodes]
+    if bad:
+        raise DatasetError(
+            f"{meta.repo_id}: no episode {', '.join(map(str, bad))}; "
+            f"it has {meta.total_episodes} (0 to {meta.total_episodes - 1})"
+        )
+    return sorted(set(episodes))
+
+
+def colour_cameras(meta: LeRobotDatasetMetadata) -> list[str]:
+    """Feature keys of the colour cameras."""
+    return [key for key in meta.camera_keys if key not in meta.depth_keys]
+
+
+def select_cameras(meta: LeRobotDatasetMetadata, cameras: list[str] | None, *, allow_moving: bool = False) -> list[str]:
+    """The cameras to re-render: those asked for (by key or its last part), else all that are not on the robot.
+
+    Raises:
+        DatasetError: a name is unknown or of a camera on the robot, or no camera is left.
+    """
+    known = colour_cameras(meta)
+    if cameras is None:
+        chosen = [key for key in known if allow_moving or not is_wrist_camera(key)]
+        if not chosen:
+            raise DatasetError(
+                f"{meta.repo_id}: no camera to re-render; its colour cameras are {', '.join(known) or 'none'}"
+            )
+        return chosen
+    chosen = []
+    for name in cameras:
+        matches = [key for key in known if name in (key, key.rsplit(".", 1)[-1])]
+        if not matches:
+            raise DatasetError(f"{meta.repo_id}: no colour camera {name!r}; it has {', '.join(known) or 'none'}")
+        chosen += [key for key in matches if key not in chosen]
+    on_robot = [key for key in chosen if is_wrist_camera(key)]
+    if on_robot and not allow_moving:
+        raise DatasetError(
+            f"{meta.repo_id}: {', '.join(on_robot)} moves with the robot, by its name: its picture is tied to the "
+            "state, and would belong to another one; leave it out, or allow it by --allow_moving"
+        )
+    return chosen
+
+
+def is_wrist_camera(key: str) -> bool:
+    """Whether a camera's name says that it moves with the robot."""
+    name = key.rsplit(".", 1)[-1].lower()
+    return any(word in name for word in ON_ROBOT)
