@@ -18,7 +18,7 @@ from lerobot_msdyn.core.errors import EpisodeError, PriorError
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.dataset.read import read_episode
 from lerobot_msdyn.reconstruction.pooled_background import MAX_EPISODES, SharedBackground, few, few_frames
-from lerobot_msdyn.reconstruction.share_background import moving_in_few, share
+from lerobot_msdyn.reconstruction.share_background import moving_in_few, share_backgrounds
 from lerobot_msdyn.render.cpu.threads import torch_on_one_thread
 
 logger = logging.getLogger(__name__)
@@ -70,7 +70,7 @@ def shared_backgrounds(
             return map(torch.from_numpy, found)
 
         with torch_on_one_thread():
-            found[key] = share(list(some.values()), moving, recipe)
+            found[key] = share_backgrounds(list(some.values()), moving, recipe)
     return found
 
 

@@ -1,4 +1,4 @@
-"""Scenes that are drawn larger than they were fitted."""
+"""Scenes that are rendered larger than they were fitted."""
 
 import math
 from dataclasses import replace

@@ -23,6 +23,7 @@ SAMPLES = 60  # frames over which medians are taken where they suffice ...
 FEW = 10  # ... which is where so many of them show the empty scene; elsewhere all frames are looked at
 MARGIN_PX = 2  # of 320: what moves bleeds so far beyond its mask: blur, the codec, and the mask's own error
 INPAINT_RADIUS_PX, LEAST_RADIUS_PX = 3, 2  # the first of 320
+NEAR = 0.01  # of the look-at distance, within which nothing is rendered: depth may be of any scale
 
 
 @dataclass(frozen=True)
@@ -186,6 +187,3 @@ def look_at_distance(depth: Float[Tensor, "h w"]) -> float:
     if known.numel() == 0:
         known = depth[depth > 0]
     return float(known.median()) if known.numel() else 1.0
-
-
-NEAR = 0.01  # of the look-at distance, within which nothing is drawn: depth may be of any scale

@@ -1,4 +1,4 @@
-"""How brightness changes over time: of the static set from the video alone, of the moving set against a drawn scene."""
+"""How brightness changes over time: of the static set by the video alone, of the moving set by a rendered scene."""
 
 import cv2
 import numpy as np
@@ -77,9 +77,9 @@ def _ratio(sums: Float32[ndarray, "a b 3"]) -> Float32[ndarray, "a b"]:
     log = np.zeros(pyramid[-1].shape[:2], np.float32)
     for level in reversed(pyramid):
         log = cv2.resize(log, level.shape[1::-1], interpolation=cv2.INTER_LINEAR)
-        known = np.clip(level[..., 2] / SURE_WEIGHT, 0, 1)
-        own = np.log((level[..., 0] + 1e-6) / (level[..., 1] + 1e-6))
-        log += known * (own - log)
+        certainty = np.clip(level[..., 2] / SURE_WEIGHT, 0, 1)
+        ratio = np.log((level[..., 0] + 1e-6) / (level[..., 1] + 1e-6))
+        log += certainty * (ratio - log)
     return np.exp(log)
 
 
@@ -91,9 +91,9 @@ def _grey(rgb: UInt8[ndarray, "h w 3"] | Float32[ndarray, "h w 3"]) -> Float32[n
 def moving_gain(scene: DynamicScene, view: View, priors: Priors, backend: str = "auto") -> UInt8[Tensor, "t m"]:
     """Coded gains by which every moving Gaussian differs from its colour over time, on the host.
 
-    At every second frame, each Gaussian that is seen is compared at its pixel: the ratio of the recorded to the drawn
-    picture, of moving surfaces only, blurred over pixels, averaged over time, and interpolated in time where unseen.
-    Drawn with the gains that the scene has already, so that these only need to be multiplied by what is returned.
+    At every second frame, each Gaussian that is seen is compared at its pixel: the ratio of the recorded to the
+    rendered picture, of moving surfaces only, blurred over pixels, averaged over time, and interpolated where unseen.
+    Rendered with the gains that the scene has already, so that these only need to be multiplied by what is returned.
     """
     frames = sorted({*range(0, len(view.rgb), MOVING_STEP), len(view.rgb) - 1})
     sums = torch.stack([_seen_sums(scene, view, priors, frame, backend) for frame in frames])  # s m 2
@@ -106,16 +106,16 @@ def moving_gain(scene: DynamicScene, view: View, priors: Priors, backend: str = 
 
 
 def _seen_sums(scene: DynamicScene, view: View, priors: Priors, frame: int, backend: str) -> Float[Tensor, "m 2"]:
-    """Blurred brightness recorded and drawn at the pixel of each moving Gaussian; zero where it is not seen."""
+    """Blurred brightness recorded and rendered at the pixel of each moving Gaussian; zero where it is not seen."""
     camera, when = view.camera.select([frame]), torch.tensor([frame])
-    drawn = to_device(render_scene(scene, camera, when, backend), "cpu")
-    usable = ((drawn.moving[0] > SURE_WEIGHT) & (priors.instances[frame] > 0)).numpy()
-    recorded, shown = _grey(view.rgb[frame].numpy()), _grey(255 * drawn.rgb[0].numpy())
-    sums = torch.from_numpy(_blurred_sums(recorded, shown, usable))
+    rendered = to_device(render_scene(scene, camera, when, backend), "cpu")
+    usable = ((rendered.moving[0] > SURE_WEIGHT) & (priors.instances[frame] > 0)).numpy()
+    recorded, rendered_grey = _grey(view.rgb[frame].numpy()), _grey(255 * rendered.rgb[0].numpy())
+    sums = torch.from_numpy(_blurred_sums(recorded, rendered_grey, usable))
     means = scene.at(when).means[0, len(scene.static) :].cpu()
     seen = projected(means, camera)
     own = sums[seen.pixel]
-    compared = seen.visible(drawn.depth[0]) & (own[:, 2] > SURE_WEIGHT)
+    compared = seen.visible(rendered.depth[0]) & (own[:, 2] > SURE_WEIGHT)
     return own[:, :2] * compared[:, None]
 
 
@@ -134,6 +134,6 @@ def _at_every_frame(
         left = right if int(times[right]) == frame else right - 1
         start, end = before[left], after[right]
         span = (times[end] - times[start]).clamp(min=1)
-        share = ((frame - times[start]) / span).clamp(0, 1)
-        out[frame] = torch.lerp(values.gather(0, start[None])[0], values.gather(0, end[None])[0], share)
+        between = ((frame - times[start]) / span).clamp(0, 1)
+        out[frame] = torch.lerp(values.gather(0, start[None])[0], values.gather(0, end[None])[0], between)
     return out

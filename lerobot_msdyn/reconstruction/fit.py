@@ -120,10 +120,10 @@ def fit(
 
 @torch.no_grad()
 def psnr(scene: DynamicScene, view: View, frames: Int[Tensor, " b"], backend: str = "auto") -> float:
-    """Peak signal-to-noise ratio (dB) of the drawn against the recorded pictures, which are on one device."""
+    """Peak signal-to-noise ratio (dB) of the rendered against the recorded pictures, which are on one device."""
     frames = frames.to(view.rgb.device)
-    drawn = render_scene(scene, view.camera.select(frames), frames, backend).rgb.clamp(0, 1)
-    error = (drawn - view.rgb[frames].float() / 255).square().mean()
+    rendered = render_scene(scene, view.camera.select(frames), frames, backend).rgb.clamp(0, 1)
+    error = (rendered - view.rgb[frames].float() / 255).square().mean()
     return float(-10 * torch.log10(error.clamp(min=1e-10)))
 
 

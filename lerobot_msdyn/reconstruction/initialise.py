@@ -49,14 +49,14 @@ def initialise(
     if empty is None:
         empty = empty_scene(view.rgb, priors.depth, priors.instances)
     static = background_gaussians(empty.rgb, empty.depth, view.camera, scene.static_gaussians)
-    found = _motion(view, priors, motion) if scene.moving_gaussians > 0 else None
-    if found is None:
+    estimated = _motion(view, priors, motion) if scene.moving_gaussians > 0 else None
+    if estimated is None:
         moving = static.select(torch.zeros(0, dtype=torch.long))
         return DynamicScene(static, moving, (), (), (), len(view.rgb))
-    moving, part = gather_moving(view, priors, found, scene)
+    moving, part = gather_moving(view, priors, estimated, scene)
     if scene.isotropic:
         static, moving = isotropic(static), isotropic(moving)
-    return DynamicScene(static, moving, found.levels, *found.bind(moving.means, part), len(view.rgb))
+    return DynamicScene(static, moving, estimated.levels, *estimated.bind(moving.means, part), len(view.rgb))
 
 
 def _motion(view: View, priors: Priors, config: MotionConfig) -> SceneMotion | None:

@@ -166,8 +166,8 @@ class ColourMatch:
 def colour_match(shared: EmptyScene, own: EmptyScene) -> ColourMatch:
     """What gives the shared picture the colours of an episode's, robustly: things that differ do not count."""
     usable = ((own.seen > 0) & (shared.seen > 0)).numpy()
-    found = np.tile(np.array([1.0, 0.0], np.float32), (3, 1))
-    for channel, line in enumerate(found):
+    lines = np.tile(np.array([1.0, 0.0], np.float32), (3, 1))  # factor and offset of each channel
+    for channel, line in enumerate(lines):
         x, y = (scene.rgb.numpy()[usable, channel].astype(np.float64) for scene in (shared, own))
         line[1] = np.median(y - x) if len(x) else 0.0
         for _ in range(AFFINE_ROUNDS):
@@ -175,7 +175,7 @@ def colour_match(shared: EmptyScene, own: EmptyScene) -> ColourMatch:
             if alike.sum() < 2 or np.ptp(x[alike]) == 0:
                 break
             line[:] = np.polyfit(x[alike], y[alike], 1)
-    return ColourMatch(torch.from_numpy(found[:, 0].copy()), torch.from_numpy(found[:, 1].copy()))
+    return ColourMatch(torch.from_numpy(lines[:, 0].copy()), torch.from_numpy(lines[:, 1].copy()))
 
 
 def shift_px(picture: UInt8[ndarray, "h w 3"], other: UInt8[ndarray, "i j 3"]) -> float:

@@ -1,4 +1,4 @@
-"""Moving Gaussians that the video disproves are taken out of a fitted scene."""
+"""Moving Gaussians that the video contradicts are taken out of a fitted scene."""
 
 import logging
 
@@ -22,7 +22,7 @@ MOST_WRONG = 0.4  # share of the frames in which it is to be seen in which a Gau
 
 
 @torch.no_grad()
-def without_disproved(scene: DynamicScene, view: View) -> DynamicScene:
+def without_contradicted(scene: DynamicScene, view: View) -> DynamicScene:
     """The scene without those of the moving set that have another colour than the video where they are to be seen.
 
     Where depth is not recorded, points that follow the motion of another body than their own are not contradicted by
@@ -44,7 +44,7 @@ def without_disproved(scene: DynamicScene, view: View) -> DynamicScene:
         seen += visible
         wrong += visible & differs
     kept = wrong <= MOST_WRONG * seen
-    logger.info("%d of %d moving Gaussians disproved by the video", count - int(kept.sum()), count)
+    logger.info("%d of %d moving Gaussians contradicted by the video", count - int(kept.sum()), count)
     return scene.select_moving(kept)
 
 

@@ -26,10 +26,10 @@ from lerobot_msdyn.reconstruction.fit import FitResult, fit
 from lerobot_msdyn.reconstruction.initialise import initialise
 from lerobot_msdyn.reconstruction.make_overlay import unexplained
 from lerobot_msdyn.reconstruction.pooled_background import SharedBackground, adapted, completed, few_frames
-from lerobot_msdyn.reconstruction.prune import without_disproved
+from lerobot_msdyn.reconstruction.prune import without_contradicted
 from lerobot_msdyn.reconstruction.result import FittedWindow, Reconstruction
 from lerobot_msdyn.reconstruction.self_check import SelfCheck, self_check
-from lerobot_msdyn.reconstruction.share_background import moving_in_few, share
+from lerobot_msdyn.reconstruction.share_background import moving_in_few, share_backgrounds
 from lerobot_msdyn.reconstruction.windows import windows
 from lerobot_msdyn.render.cpu.threads import torch_on_one_thread
 from lerobot_msdyn.render.devices import chosen_device
@@ -123,7 +123,7 @@ def _fit(draft: Draft) -> None:
 def _prune(draft: Draft) -> None:
     """Without moving Gaussians that the video contradicts; where depth is measured, depth has done that."""
     if not draft.priors.depth_traits.measured:
-        draft.scene = without_disproved(draft.scene, draft.view)
+        draft.scene = without_contradicted(draft.scene, draft.view)
 
 
 def _evidence(draft: Draft) -> None:
@@ -256,7 +256,7 @@ def _shared_by_windows(
         return [moving_in_few(parts[number], recipe, frames, episode, key) for number in numbers]
 
     with torch_on_one_thread():
-        return share([few_frames(part).shrunk(recipe.fit.max_width) for part in parts], moving, recipe)
+        return share_backgrounds([few_frames(part).shrunk(recipe.fit.max_width) for part in parts], moving, recipe)
 
 
 def _for_rough_depth(scene: SceneConfig) -> SceneConfig:

@@ -1,4 +1,4 @@
-"""One camera's reconstruction: what new views of an episode are drawn from and judged by."""
+"""One camera's reconstruction: what new views of an episode are rendered from and judged by."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

@@ -33,7 +33,7 @@ from lerobot_msdyn.render.devices import chosen_device
 logger = logging.getLogger(__name__)
 
 
-def share(views: list[View], moving: MovingIn, recipe: Recipe) -> list[SharedBackground]:
+def share_backgrounds(views: list[View], moving: MovingIn, recipe: Recipe) -> list[SharedBackground]:
     """A fitted background per place in which a camera stood, from some frames of several videos; kept on disk."""
     return [_kept([views[i] for i in group], group, moving, recipe) for group in same_places(views)]
 

@@ -9,7 +9,7 @@ from lerobot_msdyn.core.cameras import intrinsics_from_fov, static_camera
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.motion.model.bases import identity_level
 from lerobot_msdyn.reconstruction.background import background_gaussians, pixel_gaussians
-from lerobot_msdyn.reconstruction.prune import without_disproved
+from lerobot_msdyn.reconstruction.prune import without_contradicted
 from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.gaussians import rgb_to_sh
 from lerobot_msdyn.scene.shading import no_shading
@@ -43,13 +43,13 @@ def painted(scene: DynamicScene, which: torch.Tensor) -> DynamicScene:
 
 def test_what_the_video_shows_stays(square: tuple[DynamicScene, View]) -> None:
     scene, view = square
-    assert len(without_disproved(scene, view).moving) == len(scene.moving)
+    assert len(without_contradicted(scene, view).moving) == len(scene.moving)
 
 
 def test_specks_of_another_colour_go(square: tuple[DynamicScene, View]) -> None:
     scene, view = square
     specks = torch.tensor([18, 27])
-    pruned = without_disproved(painted(scene, specks), view)
+    pruned = without_contradicted(painted(scene, specks), view)
     kept = torch.ones(len(scene.moving), dtype=torch.bool).index_fill_(0, specks, False)
     torch.testing.assert_close(pruned.moving.means, scene.moving.means[kept])
     assert len(pruned.indices[0]) == len(pruned.logits[0]) == len(pruned.moving)
@@ -58,16 +58,16 @@ def test_specks_of_another_colour_go(square: tuple[DynamicScene, View]) -> None:
 def test_a_colour_that_is_wrong_for_a_short_time_is_no_reason(square: tuple[DynamicScene, View]) -> None:
     scene, view = square
     view.rgb[:2, SQUARE, SQUARE] = torch.tensor([25, 25, 230], dtype=torch.uint8)
-    assert len(without_disproved(scene, view).moving) == len(scene.moving)
+    assert len(without_contradicted(scene, view).moving) == len(scene.moving)
     view.rgb[:3, SQUARE, SQUARE] = torch.tensor([25, 25, 230], dtype=torch.uint8)
-    assert len(without_disproved(scene, view).moving) < len(scene.moving)
+    assert len(without_contradicted(scene, view).moving) < len(scene.moving)
 
 
 def test_brightness_over_time_counts(square: tuple[DynamicScene, View]) -> None:
     scene, view = square
     shading = no_shading(len(scene.static), len(scene.moving), FRAMES)
     shading.moving[:] = 255  # twice as bright, at all times
-    pruned = without_disproved(dataclasses.replace(scene, shading=shading), view)
+    pruned = without_contradicted(dataclasses.replace(scene, shading=shading), view)
     assert pruned.shading is not None
     assert len(pruned.moving) == pruned.shading.moving.shape[1] == 0
 
@@ -76,9 +76,9 @@ def test_what_is_hidden_or_outside_is_not_judged(square: tuple[DynamicScene, Vie
     scene, view = square
     blue = painted(scene, torch.arange(len(scene.moving)))
     behind = dataclasses.replace(blue, moving=dataclasses.replace(blue.moving, means=2 * blue.moving.means))
-    assert len(without_disproved(behind, view).moving) == len(scene.moving)
+    assert len(without_contradicted(behind, view).moving) == len(scene.moving)
 
 
 def test_nothing_moves(square: tuple[DynamicScene, View]) -> None:
     still = square[0].still()
-    assert without_disproved(still, square[1]) is still
+    assert without_contradicted(still, square[1]) is still
