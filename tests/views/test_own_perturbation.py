@@ -119,6 +119,24 @@ def test_two_kinds_of_one_name_are_refused() -> None:
     assert PERTURBATIONS.get("orbit") is Orbit
 
 
+def test_installed_packages_bring_kinds_by_entry_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "shaking.py").write_text(PLUGIN.read_text().replace('"swing"', '"shaking"'))
+    (tmp_path / "shaking-1.0.dist-info").mkdir()
+    (tmp_path / "shaking-1.0.dist-info" / "METADATA").write_text("Name: shaking\nVersion: 1.0\n")
+    points = "[lerobot_msdyn.views.perturbations]\nshaking = shaking:Swing\nbroken = absent:Kind\n"
+    (tmp_path / "shaking-1.0.dist-info" / "entry_points.txt").write_text(points)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(PERTURBATIONS, "_known", dict(PERTURBATIONS._known))
+    assert parse_config(AugmentConfig, ["--perturbation.azimuth_deg", "3"], {}, command="a").perturbation == Orbit(
+        azimuth_deg=3.0
+    )
+    assert "shaking" not in sys.modules, "imported only where it is named"
+    flags = ["--perturbation.type", "shaking", "--perturbation.azimuth_deg", "3"]
+    assert parse_config(AugmentConfig, flags, {}, command="a").perturbation.type_name == "shaking"
+    with pytest.raises(ConfigError, match=r"perturbation 'broken' of absent:Kind cannot be imported \(No module"):
+        parse_config(AugmentConfig, ["--perturbation.type", "broken"], {}, command="a")
+
+
 def azimuth_of(perturbation: Perturbation) -> float:
     """Run in another process."""
     return perturbation.azimuth_deg
