@@ -1,4 +1,4 @@
-"""Samples per second that a training loop is given: recorded, with views drawn on the fly, and from written episodes.
+"""Samples per second that a training loop is given: recorded, with views rendered on the fly, and from written ones.
 
     python benchmarks/training.py [--size 320x240] [--json FILE]
 

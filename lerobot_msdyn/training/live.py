@@ -23,8 +23,8 @@ class LivePictures:
     """Some frames of a new view."""
 
     rgb: UInt8[np.ndarray, "t 3 h w"]
-    depth: Float32[np.ndarray, "t h w"]  # m, z-depth; 0 where nothing is known, and everywhere without a true scale
-    alpha: Float32[np.ndarray, "t h w"]  # 0..1: below one half nothing is known
+    depth: Float32[np.ndarray, "t h w"]  # m, z-depth; 0 in holes, and everywhere without a true scale
+    alpha: Float32[np.ndarray, "t h w"]  # 0..1: a hole below `HOLE_ALPHA`
 
 
 class LiveScene:
@@ -50,11 +50,11 @@ class LiveScene:
         for i, (number, frame) in enumerate(zip(windows, frames.tolist(), strict=True)):
             window, start = self._windows[number], self.scene.starts[number]
             colours, distance, alpha = window.render(camera.select([i]), frame - start)
-            known = alpha >= HOLE_ALPHA
+            opaque = alpha >= HOLE_ALPHA
             opacity[i] = alpha
-            rgb[i] = filled_softly(colours, known)
+            rgb[i] = filled_softly(colours, opaque)
             if self.scene.metric:
-                depth[i] = np.where(known, distance, np.float32(0))
+                depth[i] = np.where(opaque, distance, np.float32(0))
         return LivePictures(rgb, depth, opacity)
 
 

@@ -56,17 +56,17 @@ def filled(
     return torch.where(torch.from_numpy(holes)[..., None], torch.from_numpy(continued).float() / 255, whole)
 
 
-def filled_softly(rgb: UInt8[ndarray, "3 h w"], known: Bool[ndarray, "h w"]) -> UInt8[ndarray, "3 h w"]:
+def filled_softly(rgb: UInt8[ndarray, "3 h w"], opaque: Bool[ndarray, "h w"]) -> UInt8[ndarray, "3 h w"]:
     """A picture whose holes show what is around them, ever more coarsely (pull-push, Gortler et al. 1996).
 
     Args:
         rgb: the picture; what it shows in its holes does not matter.
-        known: where there is no hole.
+        opaque: where there is no hole.
     """
-    if known.all() or not known.any():
+    if opaque.all() or not opaque.any():
         return rgb
-    mask = known.astype(np.uint8)
-    height, width = known.shape
+    mask = opaque.astype(np.uint8)
+    height, width = opaque.shape
     coarse = (max(width // COARSER, 1), max(height // COARSER, 1))
     weighted = [cv2.resize(plane, coarse, interpolation=cv2.INTER_AREA) for plane in (rgb * mask).astype(np.float32)]
     weight = cv2.resize(mask.astype(np.float32), coarse, interpolation=cv2.INTER_AREA)
@@ -88,7 +88,7 @@ def _pulled(weighted: Float32[ndarray, "h w 3"], weight: Float32[ndarray, "h w"]
 
 
 def _hiding(holes: Bool[ndarray, "h w"], depth: Float[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
-    """Known pixels beside holes that are nearer than others there: what hid the hole, and cannot continue it."""
+    """Pixels beside holes that are nearer than others there: what hid the hole, and cannot continue it."""
     inner = _inside(holes)
     if not inner.any():
         return np.zeros_like(holes)

@@ -26,7 +26,7 @@ class Picture:
     """One frame of a new view."""
 
     rgb: UInt8[np.ndarray, "h w 3"]
-    depth: Float32[np.ndarray, "h w"]  # m, z-depth; 0 where nothing is known, and everywhere if there is no true scale
+    depth: Float32[np.ndarray, "h w"]  # m, z-depth; 0 in holes, and everywhere without a true scale
     unseen: Bool[np.ndarray, "h w"]  # uncovered: what no recorded frame has shown
 
 
@@ -47,8 +47,7 @@ def new_pictures(
         rgb, depths = to_device(((composed * 255).round().to(torch.uint8), rendering.depth), "cpu")
         for i, coverage in enumerate(of_frames):
             shares.append(coverage.unseen_share)
-            known = ~coverage.empty & scene.metric
-            depth = np.where(known, depths[i].numpy(), np.float32(0))
+            depth = np.where(~coverage.empty & scene.metric, depths[i].numpy(), np.float32(0))
             yield Picture(rgb[i].numpy(), depth, coverage.unseen)
     logger.info("%.1f %% of the pixels are uncovered (worst frame %.1f %%)", 100 * np.mean(shares), 100 * max(shares))
 

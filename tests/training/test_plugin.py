@@ -61,7 +61,7 @@ def train(root: Path, folder: Path, views: str | None, *flags: str) -> subproces
 
 
 @pytest.mark.slow
-def test_batches_hold_drawn_views(desk: Path, desk_scenes: Path, tmp_path: Path) -> None:
+def test_batches_hold_rendered_views(desk: Path, desk_scenes: Path, tmp_path: Path) -> None:
     views = f"--scenes {desk_scenes} --probability 0.5 --seed 3"
     options = ("--steps=14", "--batch_size=4", "--num_workers=2", "--dataset.episodes=[0,1]")
     done = train(desk, tmp_path, views, PLUGIN, *options)
@@ -71,15 +71,15 @@ def test_batches_hold_drawn_views(desk: Path, desk_scenes: Path, tmp_path: Path)
     assert len(batches) == 14
     dataset = LeRobotDataset("local/desk", root=desk, video_backend="pyav", return_uint8=True, episodes=[0, 1])
     mixed = MixedViews(dataset, desk_scenes, 0.5, seed=3)
-    drawn = []
+    replaced = []
     for number, batch in enumerate(batches):
         mixed.set_epoch(number // 6)  # 24 frames in batches of 4
         for index, image in zip(batch["index"].tolist(), batch[FRONT], strict=True):
             seen = (255 * image).round().to(torch.uint8)
             assert torch.equal(seen, mixed[index][FRONT]), "each sample is what MixedViews says it is"
-            drawn.append(not torch.equal(seen, dataset[index][FRONT]))
-    assert 0.25 < sum(drawn) / len(drawn) < 0.75
-    assert drawn[:24] != drawn[24:48], "epochs differ"
+            replaced.append(not torch.equal(seen, dataset[index][FRONT]))
+    assert 0.25 < sum(replaced) / len(replaced) < 0.75
+    assert replaced[:24] != replaced[24:48], "epochs differ"
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""What of a new view is known: against made-up scenes whose every surface is known."""
+"""What of a new view is uncovered: against synthetic scenes whose every surface is known."""
 
 import pytest
 import torch
