@@ -1,4 +1,4 @@
-# make demo    set everything up and run the main job on a small made-up dataset
+# make demo    set everything up and run the main job on a small synthetic dataset
 # make test    set everything up and run the tests
 # make lint    formatting, lint and types
 .PHONY: setup demo test lint clean
@@ -7,7 +7,7 @@ PYTHON ?= $(shell command -v python || command -v python3)
 UV := $(shell command -v uv || echo .tools/bin/uv)
 VENV := .venv
 BIN := $(VENV)/bin
-EXTRAS := cuda,viz,priors,sfm,cluster,evaluate,dev
+EXTRAS := cuda,viz,priors,sfm,evaluate,dev
 TESTS ?= tests
 
 setup: $(VENV)/.ready

@@ -221,7 +221,7 @@ def break_copy(original: Path, place: Path, rng: random.Random) -> str:
 def command(place: Path, limit_s: int, *, whole: bool) -> tuple[int | None, list[str], str]:
     """Run the command on `place`/ds; the exit code, what went wrong, and what was said."""
     said, code, faults = io.StringIO(), None, []
-    engines.augment_episode = REAL if whole else fake_episode
+    setattr(engines, "augment_episode", REAL if whole else fake_episode)  # noqa: B010 (another signature)
     logging.basicConfig(level=logging.INFO, stream=said, force=True)
     begin = time.perf_counter()
     signal.alarm(limit_s)

@@ -102,12 +102,16 @@ class Device:
 
 def on(load: Workload, device: torch.device, dtype: torch.dtype = torch.float32) -> Workload:
     """A workload on a device."""
+    means, quats, scales, opacities, features = (
+        values.detach().to(device, dtype).requires_grad_() for values in load.gaussians
+    )
+    of_features, of_depth, of_alpha = (values.to(device, dtype) for values in load.incoming)
     return replace(
         load,
-        gaussians=tuple(values.detach().to(device, dtype).requires_grad_() for values in load.gaussians),
+        gaussians=(means, quats, scales, opacities, features),
         pose=load.pose.to(device, dtype),
         intrinsics=load.intrinsics.to(device, dtype),
-        incoming=tuple(values.to(device, dtype) for values in load.incoming),
+        incoming=(of_features, of_depth, of_alpha),
     )
 
 

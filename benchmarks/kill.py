@@ -86,7 +86,8 @@ def main() -> int:
         return 1
     duration = time.perf_counter() - begin
     rng = random.Random(options.seed)
-    code, moments = None, []
+    code: int | None = None
+    moments: list[float] = []
     while code is None:
         process = start(options.root, killed, flags, options.out / "cache_killed", log)
         wait = rng.uniform(0.02, 1.0) * 2.5 * duration / options.kills if len(moments) < options.kills else None

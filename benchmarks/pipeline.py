@@ -106,10 +106,10 @@ def measure(case: Case, recipe_name: str, steps: int | None, pipe: Connection) -
         read = timed(read_episode, "read", seconds)
         render = timed(lambda scene, camera: list(new_pictures(scene, camera)), "render", seconds)
         backgrounds = share(source, [key], recipe)
-        steps = {name: timed(step, name, seconds) for name, step in STEPS.items()}
+        timed_steps = {name: timed(step, name, seconds) for name, step in STEPS.items()}
         for index in range(case.episodes):
             view = read(source, index, [key], recipe.camera).views[key]
-            scene = reconstruct(view, recipe, backgrounds=backgrounds.get(key, []), steps=steps)
+            scene = reconstruct(view, recipe, backgrounds=backgrounds.get(key, []), steps=timed_steps)
             for variant in range(case.variants):
                 render(scene, new_cameras({key: scene}, recipe, index, variant).cameras[key])
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)

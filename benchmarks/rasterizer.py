@@ -39,11 +39,14 @@ SLOWER_THAN_BASELINE = 1.25  # of the ratio to the reference
 BASELINE = Path(__file__).with_suffix(".json")
 
 
+Gaussians = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]  # means, quats, scales, opacities, features
+
+
 @dataclass(frozen=True)
 class Workload:
     """A scene, its camera, and gradients to send back."""
 
-    gaussians: tuple[Tensor, ...]
+    gaussians: Gaussians
     pose: Tensor
     intrinsics: Tensor
     width: int
@@ -94,16 +97,18 @@ def make_workload(name: str, channels: int, seed: int = 0) -> Workload:
         normal(1, height, width),
         normal(1, height, width),
     )
-    leaves = tuple(values.requires_grad_() for values in gaussians)
-    return Workload(leaves, pose[None], intrinsics[None], width, height, incoming)
+    for values in gaussians:
+        values.requires_grad_()
+    return Workload(gaussians, pose[None], intrinsics[None], width, height, incoming)
 
 
-def interleaved(first: Callable[[], None], second: Callable[[], None], rounds: int) -> list[list[float]]:
+def interleaved(first: Callable[[], object], second: Callable[[], object], rounds: int) -> list[list[float]]:
     """Wall ms of both, and processor ms of this thread in the first, alternating; after one warm-up each.
 
     The first is so much faster that each of its samples is the median of several runs.
     """
-    first(), second()
+    first()
+    second()
     samples: list[list[float]] = [[], [], []]
     for _ in range(rounds):
         inner = [timed(first) for _ in range(5)]
@@ -113,7 +118,7 @@ def interleaved(first: Callable[[], None], second: Callable[[], None], rounds: i
     return samples
 
 
-def timed(call: Callable[[], None]) -> tuple[float, float]:
+def timed(call: Callable[[], object]) -> tuple[float, float]:
     """Wall and thread-processor ms of a call."""
     wall, cpu = time.perf_counter(), time.thread_time()
     call()

@@ -5,10 +5,10 @@ import math
 from pathlib import Path
 
 import av
-import cv2
 import numpy as np
 import pytest
 import torch
+from pictures import read_picture
 
 from lerobot_msdyn.core.errors import ConfigError, OutputError
 from lerobot_msdyn.core.geometry import invert_se3, project, transform_points, unproject_image
@@ -383,10 +383,10 @@ def test_the_nvs_folder_is_complete(tmp_path: Path) -> None:
         assert held["covis"].shape == held["seg"].shape == (HEIGHT, WIDTH, 2)
         with av.open(str(root / "gt" / "heldout" / f"{name}.mkv")) as container:
             video = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-        stills = [cv2.imread(str(root / "gt" / "heldout" / name / f"rgb_{f:04d}.png"))[..., ::-1] for f in (0, 3)]
+        stills = [read_picture(root / "gt" / "heldout" / name / f"rgb_{f:04d}.png") for f in (0, 3)]
         np.testing.assert_array_equal(np.stack(video), np.stack(stills))
     expected = scene.render(heldout_cameras(1, WIDTH, HEIGHT)["dolly"], [3]).rgb[0].numpy()
-    np.testing.assert_array_equal(cv2.imread(str(root / "gt/heldout/dolly/rgb_0003.png"))[..., ::-1], expected)
+    np.testing.assert_array_equal(read_picture(root / "gt/heldout/dolly/rgb_0003.png"), expected)
     with pytest.raises(OutputError, match="exists already"):
         write_nvs_folder(scene, root)
     with pytest.raises(ConfigError, match="every must be at least 1"):

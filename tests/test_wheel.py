@@ -23,8 +23,9 @@ def test_recipes_are_in_the_wheel_and_found_by_name(tmp_path: Path) -> None:
     assert not any(name.startswith(("tests/", "examples/", "recipes/")) for name in names)
 
     def said(*arguments: str) -> str:
-        where = {"env": {"PYTHONPATH": str(tmp_path / "installed")}, "cwd": tmp_path}
-        return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, check=True, **where).stdout
+        path = {"PYTHONPATH": str(tmp_path / "installed")}
+        command = [sys.executable, *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True, env=path, cwd=tmp_path).stdout
 
     listed = [line.split()[0] for line in said("-m", "lerobot_msdyn.recipes", "ls").splitlines()]
     assert listed == sorted(path.stem for path in (PROJECT / "recipes").glob("*.yaml"))

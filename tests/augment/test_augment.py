@@ -5,27 +5,15 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
+from augment_command import FAST, FRONT, SIDE, run
 from lerobot.datasets import LeRobotDataset
-
-from lerobot_msdyn.augment import __main__ as augment
-from lerobot_msdyn.core.cli import run_command
-
-FRONT, SIDE = "observation.images.front", "observation.images.side"
-FAST = ("--fit.steps", "8", "--scene.moving_gaussians", "500", "--scene.moving_frames", "4", "--fit.max_width", "48")
-
-
-def run(*arguments: str) -> int:
-    """The exit code of the command."""
-    with pytest.raises(SystemExit) as caught:
-        run_command(augment.run, [*arguments])
-    assert isinstance(caught.value.code, int)
-    return caught.value.code
 
 
 @pytest.fixture(scope="module")
@@ -173,7 +161,7 @@ def test_a_fault_in_one_episode_does_not_cost_the_others(
 
     whole = engines.augment_episode
 
-    def faulty(source: object, index: int, *rest: object) -> object:
+    def faulty(source: Any, index: int, *rest: Any) -> object:
         if index == 0:
             raise RuntimeError("a fault")
         return whole(source, index, *rest)
@@ -196,9 +184,9 @@ def test_a_run_that_was_stopped_goes_on_and_gives_the_same_files(
     from lerobot_msdyn.augment import run as engines
 
     whole = engines.augment_episode
-    begun = []
+    begun: list[int] = []
 
-    def stopped(source: object, index: int, *rest: object) -> object:
+    def stopped(source: Any, index: int, *rest: Any) -> object:
         if index == 2 and begun:
             raise KeyboardInterrupt
         begun.append(index)

@@ -8,8 +8,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
+from augment_command import FAST, FRONT, SIDE, run
 from lerobot.datasets import LeRobotDataset
-from test_augment import FAST, FRONT, SIDE, run
 
 from lerobot_msdyn.core.geometry import axis_angle_to_matrix, invert_se3, se3
 from lerobot_msdyn.dataset.provenance import read_unseen

@@ -143,9 +143,9 @@ COMMANDS = {  # what each command line sets
 }
 
 
-def command_configs() -> dict[str, type]:
+def command_configs() -> dict[str, Any]:
     """By name, every dataclass of the package that is called a Config, wherever it stands, and Recipe."""
-    found = {}
+    found: dict[str, Any] = {}
     for path in PACKAGE.rglob("*.py"):
         for node in ast.parse(path.read_text()).body:
             if isinstance(node, ast.ClassDef) and (node.name.endswith("Config") or node.name == "Recipe"):

@@ -1,6 +1,7 @@
 """Pictures are encoded in order, beside what draws them, and a fault on either side ends both."""
 
 import threading
+from collections.abc import Iterator
 
 import pytest
 
@@ -25,7 +26,10 @@ def test_work_is_done_in_order_in_another_thread() -> None:
 def test_only_so_many_are_made_ahead() -> None:
     made, release = [], threading.Event()
 
-    def items():
+    def wait(item: int) -> None:
+        release.wait(30)
+
+    def items() -> Iterator[int]:
         for item in range(pictures.AHEAD + 5):
             made.append(item)
             if item == pictures.AHEAD:
@@ -33,7 +37,7 @@ def test_only_so_many_are_made_ahead() -> None:
             assert item <= pictures.AHEAD or release.is_set()
             yield item
 
-    assert pictures._meanwhile(lambda item: release.wait(30) and None, items()) == pictures.AHEAD + 5
+    assert pictures._meanwhile(wait, items()) == pictures.AHEAD + 5
 
 
 def test_a_fault_of_the_work_is_raised() -> None:
@@ -46,9 +50,9 @@ def test_a_fault_of_the_work_is_raised() -> None:
 
 
 def test_a_fault_of_the_drawing_is_raised_when_the_work_is_done() -> None:
-    done = []
+    done: list[int] = []
 
-    def items():
+    def items() -> Iterator[int]:
         yield 1
         raise KeyboardInterrupt
 

@@ -4,9 +4,9 @@ import importlib
 import json
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
+from pictures import read_picture
 
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.evaluate import __main__ as evaluate
@@ -36,7 +36,7 @@ def test_the_fit_beats_the_recorded_picture(
     truth = read_sequence(sequence, protocol)
     assert sorted(path.stem for path in (tmp_path / "rgb").iterdir()) == sorted(truth.validation)
     for name in truth.validation:  # the scores are those of the pictures that were written
-        drawn = cv2.imread(str(tmp_path / "rgb" / f"{name}.png"), cv2.IMREAD_COLOR_RGB)
+        drawn = read_picture(tmp_path / "rgb" / f"{name}.png")
         true, mask = truth.true_picture(name), truth.covisible(name)
         assert found["images"][name]["mpsnr"] == pytest.approx(masked_psnr_db(drawn, true, mask), abs=1e-4)
         assert found["images"][name]["mssim"] == pytest.approx(partial_ssim(drawn, true, mask), abs=1e-4)

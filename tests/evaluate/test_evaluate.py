@@ -4,9 +4,9 @@ import json
 import shutil
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
+from pictures import read_picture
 
 from lerobot_msdyn.core.cli import run_command
 from lerobot_msdyn.dataset.read import open_source, read_colour
@@ -41,8 +41,8 @@ def psnr(folder: Path, out: Path, camera: str) -> float:
     truth = np.load(folder / "gt" / "heldout" / f"{camera}.npz")
     errors = []
     for frame, seen in zip(truth["frame"], np.moveaxis(truth["covis"], -1, 0) > 0, strict=True):
-        drawn = cv2.imread(str(out / camera / f"rgb_{frame:04d}.png")).astype(float)
-        true = cv2.imread(str(folder / "gt" / "heldout" / camera / f"rgb_{frame:04d}.png")).astype(float)
+        drawn = read_picture(out / camera / f"rgb_{frame:04d}.png").astype(float)
+        true = read_picture(folder / "gt" / "heldout" / camera / f"rgb_{frame:04d}.png").astype(float)
         errors.append(((drawn - true)[seen] ** 2).mean())
     return float(10 * np.log10(255**2 / np.mean(errors)))
 
@@ -51,7 +51,7 @@ def unchanged_psnr(folder: Path, camera: str) -> float:
     """Of the first recorded frame, taken for the view of another camera at that time."""
     source = open_source("local/push", folder / "dataset")
     recorded = read_colour(source, 0, "observation.images.front", read_rows(source, 0))[0].numpy().astype(float)
-    true = cv2.imread(str(folder / "gt" / "heldout" / camera / "rgb_0000.png"))[..., ::-1]
+    true = read_picture(folder / "gt" / "heldout" / camera / "rgb_0000.png")
     return float(10 * np.log10(255**2 / ((recorded - true) ** 2).mean()))
 
 

@@ -43,7 +43,7 @@ def test_flip_of_black_and_white() -> None:
 
 
 def test_mlpips_is_the_mean_of_the_map_over_the_mask() -> None:
-    seen = []
+    seen: list[torch.Tensor] = []
 
     def network(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
         seen.extend((one, other))

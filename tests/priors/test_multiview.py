@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from test_stereo import moved
+from rig import moved
 
 from lerobot_msdyn.core.errors import PriorError
 from lerobot_msdyn.core.observations import View

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from conftest import texture
+from sliding import texture
 
 from lerobot_msdyn.priors.camera.steadiness import FIXED_PX, SWAY_PX, camera_motion_px
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from test_stereo import moved
+from rig import moved
 
 from lerobot_msdyn.priors.depth.triangulate import confirmed, find_features, matched_points, spread, without_outliers
 from lerobot_msdyn.synthetic import make_scene

@@ -14,7 +14,7 @@ from lerobot_msdyn.render import Raster, rasterize
 class Scene:
     """What `rasterize` takes: Gaussians in front of a few cameras that look along +z from near the origin."""
 
-    gaussians: tuple[Tensor, ...]  # means, quats, scales, opacities, features
+    gaussians: tuple[Tensor, Tensor, Tensor, Tensor, Tensor]  # means, quats, scales, opacities, features
     poses: Tensor
     intrinsics: Tensor
     width: int
@@ -26,8 +26,10 @@ class Scene:
         """The images, and the leaves (Gaussians, then poses) that their gradients go to."""
         tensors = [values.to(device, dtype) for values in (*self.gaussians, self.poses)]
         leaves = [values.detach().clone().requires_grad_() for values in tensors]
+        means, quats, scales, opacities, features, poses = leaves
         intrinsics = self.intrinsics.to(device, dtype)
-        return rasterize(*leaves, intrinsics, self.width, self.height, backend=backend), leaves
+        size = (self.width, self.height)
+        return rasterize(means, quats, scales, opacities, features, poses, intrinsics, *size, backend=backend), leaves
 
 
 def random_scene(
@@ -54,17 +56,16 @@ def random_scene(
     scales = radius / focal * depth[:, None] * torch.exp(0.5 * torch.randn(count, 3, generator=generator))
     quats = torch.randn(count, 4, generator=generator) * 2
     opacities = opacity[0] + (opacity[1] - opacity[0]) * uniform(count)
-    gaussians = [means, quats, scales, opacities, uniform(count, channels)]
-    for index in per_view:
-        base = gaussians[index]
-        gaussians[index] = base * (1 + 0.05 * uniform(views, *base.shape) - 0.05)
+    shared = (means, quats, scales, opacities, uniform(count, channels))
+    varied = {i: shared[i] * (1 + 0.05 * uniform(views, *shared[i].shape) - 0.05) for i in per_view}
+    means, quats, scales, opacities, features = (varied.get(i, values) for i, values in enumerate(shared))
     poses = torch.eye(4).repeat(views, 1, 1)
     angles = 0.1 * (uniform(views) - 0.5)
     poses[:, 0, 0] = poses[:, 2, 2] = angles.cos()
     poses[:, 0, 2], poses[:, 2, 0] = angles.sin(), -angles.sin()
     poses[:, :3, 3] = 0.1 * (uniform(views, 3) - 0.5)
     intrinsics = torch.tensor([[focal, 0, width / 2 + 0.3], [0, 1.1 * focal, height / 2 - 0.2], [0, 0, 1]])
-    return Scene(tuple(gaussians), poses, intrinsics.repeat(views, 1, 1), width, height)
+    return Scene((means, quats, scales, opacities, features), poses, intrinsics.repeat(views, 1, 1), width, height)
 
 
 @pytest.fixture
@@ -73,8 +74,11 @@ def make_scene():
     return random_scene
 
 
-def relative_error(got: Tensor, expected: Tensor) -> float:
-    """|got - expected| / |expected|, over all entries."""
+def relative_error(got: Tensor | None, expected: Tensor | None) -> float:
+    """|got - expected| / |expected|, over all entries; both must be there."""
+    assert got is not None
+    assert expected is not None
+    got = got.to(expected.device)
     return (torch.linalg.norm((got - expected).double()) / torch.linalg.norm(expected.double())).item()
 
 
@@ -112,7 +116,7 @@ def compare(
     torch.autograd.backward([getattr(fast, name) for name in names], incoming)
     torch.autograd.backward([getattr(exact, name) for name in names], [values.double() for values in incoming])
     gradients = [
-        relative_error(a.grad.cpu(), b.grad) for a, b in zip(fast_leaves, exact_leaves, strict=True) if b.numel() > 0
+        relative_error(a.grad, b.grad) for a, b in zip(fast_leaves, exact_leaves, strict=True) if b.numel() > 0
     ]
     assert all(math.isfinite(value) for value in gradients)
     return Comparison((error > 1e-4).double().mean().item(), error[error <= 1e-4].max().item(), gradients)

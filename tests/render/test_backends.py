@@ -5,6 +5,7 @@ import math
 import os
 import subprocess
 import sys
+from typing import Any
 
 import pytest
 import torch
@@ -16,8 +17,8 @@ from lerobot_msdyn.render.validation import check_shapes
 NAMES = ("means", "quats", "scales", "opacities", "features")
 
 
-def arguments(scene, **changes):
-    values = dict(zip(NAMES, scene.gaussians, strict=True))
+def arguments(scene, **changes: Any) -> dict[str, Any]:
+    values: dict[str, Any] = dict(zip(NAMES, scene.gaussians, strict=True))
     values |= {"camera_from_world": scene.poses, "intrinsics": scene.intrinsics}
     values |= {"width": scene.width, "height": scene.height}
     return values | changes
@@ -32,15 +33,15 @@ def test_auto_draws_float32_on_the_cpu_with_numba(make_scene):
 def test_auto_leaves_float64_and_many_channels_to_the_reference(make_scene, channels):
     scene = make_scene(channels=channels)
     dtype = torch.float64 if channels == 3 else torch.float32
-    values = {key: v.to(dtype) if torch.is_tensor(v) else v for key, v in arguments(scene).items()}
+    values: dict[str, Any] = {key: v.to(dtype) if torch.is_tensor(v) else v for key, v in arguments(scene).items()}
     raster = rasterize(**values)
     assert raster.features.dtype == dtype
     assert torch.equal(raster.features, rasterize(**values, backend="reference").features)
 
 
 def test_auto_falls_back_with_one_warning_where_numba_cannot_run(make_scene, monkeypatch, caplog):
-    monkeypatch.setattr(backends, "_load", lambda name: (None, "no numba here") if name == "cpu" else (draw, ""))
     draw = backends.rasterize_reference
+    monkeypatch.setattr(backends, "_load", lambda name: (None, "no numba here") if name == "cpu" else (draw, ""))
     backends._warn_once.cache_clear()
     with caplog.at_level(logging.WARNING):
         rasterize(**arguments(make_scene()))

@@ -1,5 +1,7 @@
 """The CPU rasterizer draws what the reference draws, and its gradients are the reference's."""
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -42,8 +44,9 @@ def test_views_of_a_batch_equal_single_views(make_scene):
     scene = make_scene(views=3)
     together, _ = scene.draw("cpu")
     for view in range(3):
-        arguments = (*scene.gaussians, scene.poses[view : view + 1], scene.intrinsics[view : view + 1])
-        alone = rasterize(*arguments, scene.width, scene.height, backend="cpu")
+        camera = (scene.poses[view : view + 1], scene.intrinsics[view : view + 1])
+        arguments: Any = (*scene.gaussians, *camera, scene.width, scene.height)
+        alone = rasterize(*arguments, backend="cpu")
         assert torch.equal(alone.features[0], together.features[view])
         assert torch.equal(alone.depth[0], together.depth[view])
 

@@ -8,6 +8,7 @@ import importlib
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
@@ -86,8 +87,8 @@ def test_an_empty_scene_and_bad_values(make_scene):
 def test_auto_takes_gsplat_on_the_gpu(make_scene):
     scene = make_scene()
     tensors = [values.cuda() for values in (*scene.gaussians, scene.poses, scene.intrinsics)]
-    size = (scene.width, scene.height)
-    assert torch.equal(rasterize(*tensors, *size).features, rasterize(*tensors, *size, backend="cuda").features)
+    arguments: Any = (*tensors, scene.width, scene.height)
+    assert torch.equal(rasterize(*arguments).features, rasterize(*arguments, backend="cuda").features)
 
 
 @pytest.mark.parametrize("name", ["W1", "W2", "W3"])

@@ -5,6 +5,7 @@ torch code, to the reference. The kernels themselves are run by tests/gpu alone.
 """
 
 import inspect
+from typing import Any
 
 import pytest
 import torch
@@ -29,13 +30,14 @@ def leaves_of(scene, dtype=torch.float64) -> list[Tensor]:
 def by_gsplat(scene, near: float = NEAR) -> tuple[Raster, list[Tensor]]:
     leaves = leaves_of(scene)
     with gsplat_on_cpu():
-        raster = cuda.draw_with_gsplat(*leaves, scene.intrinsics.double(), scene.width, scene.height, near)
+        arguments: Any = (*leaves, scene.intrinsics.double(), scene.width, scene.height, near)
+        raster = cuda.draw_with_gsplat(*arguments)
     return raster, leaves
 
 
 def by_reference(scene, near: float = NEAR) -> tuple[Raster, list[Tensor]]:
     leaves = leaves_of(scene)
-    arguments = (*leaves, scene.intrinsics.double(), scene.width, scene.height)
+    arguments: Any = (*leaves, scene.intrinsics.double(), scene.width, scene.height)
     return rasterize(*arguments, backend="reference", near=near), leaves
 
 

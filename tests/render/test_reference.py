@@ -1,9 +1,11 @@
 """The reference rasterizer against values worked out by hand."""
 
 import math
+from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
 from lerobot_msdyn.core.errors import RenderError
 from lerobot_msdyn.render import rasterize
@@ -91,6 +93,7 @@ def test_alpha_is_capped_and_a_pixel_stops_before_it_is_opaque():
 def test_no_gradient_flows_through_a_capped_alpha():
     opacity = torch.ones(1, dtype=torch.float64, requires_grad=True)
     draw([[0, 0, 2.0]], opacity, [[1.0]]).alpha[0, 4, 4].backward()
+    assert opacity.grad is not None
     assert opacity.grad.item() == 0
 
 
@@ -154,8 +157,9 @@ def test_gradients_of_all_gaussian_parameters_and_the_pose():
     camera[:, :3, :3] += uniform(2, 3, 3, low=-0.02, high=0.02)
     intrinsics = torch.tensor([[12.0, 0, 5.5], [0, 13.0, 5.0], [0, 0, 1]], dtype=torch.float64).expand(2, 3, 3)
 
-    def image(*inputs):
-        raster = rasterize(*inputs, intrinsics, width, height, backend="reference")
+    def image(*inputs: Any) -> tuple[Tensor, Tensor, Tensor]:
+        arguments: Any = (*inputs, intrinsics, width, height)
+        raster = rasterize(*arguments, backend="reference")
         return raster.features, raster.depth, raster.alpha
 
     inputs = tuple(value.requires_grad_() for value in (*parameters, camera))

@@ -55,8 +55,9 @@ class FakeGpu(TorchFunctionMode):
                     return torch.arange(len(first), device=first.device)[:, None]
         if torch.device("cuda") in _devices(args, kwargs):  # copied to it, or made there
             with self.mode:
-                plain = isinstance(first, Tensor) and not isinstance(first, FakeTensor)
-                return func(*((self.mode.from_tensor(first), *args[1:]) if plain else args), **kwargs)
+                if isinstance(first, Tensor) and not isinstance(first, FakeTensor):
+                    args = (self.mode.from_tensor(first), *args[1:])
+                return func(*args, **kwargs)
         if any(isinstance(value, FakeTensor) for value in tree_leaves((args, kwargs))):
             with self.mode:  # refuses tensors of the host, but for those of one number
                 return func(*args, **kwargs)
@@ -76,9 +77,9 @@ def _caller() -> str:
     return f"{frames[-1].filename.removeprefix(package + '/')} {frames[-1].name}" if frames else "test"
 
 
-def fake_rasterize(*tensors: Any, near: float, backend: str = "auto") -> Raster:
+def fake_rasterize(*arguments: Any, near: float, backend: str = "auto") -> Raster:
     """In place of `rasterize`: as wide and as differentiable, of no meaning; all tensors must be on the fake GPU."""
-    *tensors, width, height = tensors
+    *tensors, width, height = arguments
     assert {tensor.device.type for tensor in tensors} == {"cuda"}, [tensor.device for tensor in tensors]
     views, channels = len(tensors[5]), tensors[4].shape[-1]
     everything = torch.stack([tensor.sum() for tensor in tensors]).sum()
