@@ -5,9 +5,9 @@
     python benchmarks/ablation.py --report
 
 Every row is fitted to the same videos with the same priors (recorded depth, the project's own masks and tracks, or the
-true ones), number of steps, losses and rasterizer, and drawn from held-out cameras. FILE gets a row's figures as soon
-as they are known; what it holds already is not measured again, so a run that was stopped goes on. `--report` prints the
-table of what FILE holds and draws docs/images/ablation.svg.
+true ones), number of steps, losses and rasterizer, and rendered from held-out cameras. FILE gets a row's figures as
+soon as they are known; what it holds already is not measured again, so a run that was stopped goes on. `--report`
+prints the table of what FILE holds and plots it as docs/images/ablation.svg.
 
 PSNR (dB) of a picture is over the pixels that the recorded camera has seen at some time (`all`), those of bodies that
 move (`moving`), and those it saw only at another time (`disoccluded`); figures are means over cameras and frames.
@@ -16,8 +16,8 @@ Rows are without overlay, which hides errors of motion, unless they say so.
 L1, L1+L2, L1+L2+ (ten primitives), L1-L3 and L4 (particles) are the paper's: an object is an instance, and all levels
 are fitted to the tracks and kept. `of parts`: an instance is split into rigid parts first. `the method` is what the
 package does: parts registered to the video, finer levels only where they prove themselves. `rgb only`: without the
-losses of depth and mask. `flat 10`: Shape of Motion's model; `field`: Deformable 3D Gaussians'; both fitted to the
-tracks. `learned`: motion takes part in the fit; `afresh`: from none at all.
+losses of depth and mask. `flat 10`: Shape of Motion's model; `field`: Deformable 3D Gaussians' (rivals/); both fitted
+to the tracks. `learned`: motion takes part in the fit; `afresh`: from none at all.
 """
 
 import argparse
@@ -31,8 +31,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rivals
 import torch
-from ablation_report import drawn_table, plot, scene_table
+from ablation_report import overview_table, plot, scene_table
 from ablation_rivals import warped_pictures, with_fixed_motion, with_learned_motion
 from ablation_scenes import Case, HeldOut, simulated_case, synthetic_case
 from jaxtyping import UInt8
@@ -42,6 +43,7 @@ from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.files import write_whole
 from lerobot_msdyn.evaluate.metrics import masked_psnr_db
 from lerobot_msdyn.priors import Priors, estimate_priors
+from lerobot_msdyn.reconstruction.background import EmptyScene, empty_scene, look_at_distance
 from lerobot_msdyn.reconstruction.fit import fit
 from lerobot_msdyn.reconstruction.reconstruct import Draft, reconstruct, with_steps
 from lerobot_msdyn.reconstruction.result import Reconstruction
@@ -51,6 +53,7 @@ from lerobot_msdyn.views.pictures import new_pictures
 JSON = Path(__file__).with_suffix(".json")
 PLOT = Path(__file__).parent.parent / "docs" / "images" / "ablation.svg"
 ALL = ["object", "primitive", "grain"]
+rivals.register()
 TRACKS = {"gate": False, "register": False}  # levels are fitted to the tracks, and kept
 PAPER = TRACKS | {"max_parts": 1}  # and an object is an instance
 
@@ -95,8 +98,8 @@ class Settings:
 
     steps: int = 100
     width: int = 160  # px
-    frames: int = 40  # of made-up scenes
-    every: int = 8  # frames of made-up scenes with truth
+    frames: int = 40  # of synthetic scenes
+    every: int = 8  # frames of synthetic scenes with truth
     stride: int = 2  # frames of simulated episodes that are used ...
     sim_every: int = 3  # ... and of those with truth
 
@@ -121,7 +124,7 @@ def recipe_of(row: Row, settings: Settings, seed: int) -> Recipe:
     return recipe
 
 
-def prepared(case: Case) -> Prepared:
+def prepare(case: Case) -> Prepared:
     """The priors of a case's video: the project's own, or the truth where the case has it."""
     recipe = recipe_of(ROWS[0], Settings(), case.seed)
     priors = estimate_priors(case.view, recipe.priors, recipe.camera)
@@ -130,14 +133,14 @@ def prepared(case: Case) -> Prepared:
     return Prepared(case, priors, empty_scene(case.view.rgb, priors.depth, priors.instances))
 
 
-def reconstructed(known: Prepared, row: Row, recipe: Recipe) -> Reconstruction:
+def reconstructed(prepared: Prepared, row: Row, recipe: Recipe) -> Reconstruction:
     """A row's scene: the package's own steps on given priors, with motion that is learned where the row says so."""
 
     def given_priors(draft: Draft) -> None:
-        draft.priors = known.priors
+        draft.priors = prepared.priors
 
     def given_background(draft: Draft) -> None:
-        draft.empty, draft.distance = known.empty, look_at_distance(known.empty.depth)
+        draft.empty, draft.distance = prepared.empty, look_at_distance(prepared.empty.depth)
 
     def fitted(draft: Draft) -> None:
         scene, learned = draft.scene, []
@@ -156,14 +159,16 @@ def reconstructed(known: Prepared, row: Row, recipe: Recipe) -> Reconstruction:
         draft.scene = with_fixed_motion(draft.fitted.scene)
 
     steps = with_steps({"priors": given_priors, "background": given_background, "fit": fitted})
-    return reconstruct(known.case.view, recipe, steps=steps)
+    return reconstruct(prepared.case.view, recipe, steps=steps)
 
 
-def pictures(known: Prepared, row: Row, settings: Settings) -> Iterator[tuple[HeldOut, list[UInt8[ndarray, "h w 3"]]]]:
+def pictures(
+    prepared: Prepared, row: Row, settings: Settings
+) -> Iterator[tuple[HeldOut, list[UInt8[ndarray, "h w 3"]]]]:
     """What a row shows of each held-out camera."""
-    case = known.case
+    case = prepared.case
     if row.motion:
-        scene = reconstructed(known, row, recipe_of(row, settings, case.seed))
+        scene = reconstructed(prepared, row, recipe_of(row, settings, case.seed))
     for heldout in case.heldout:
         if row.motion:
             frames = torch.from_numpy(heldout.frames).long()
@@ -171,25 +176,25 @@ def pictures(known: Prepared, row: Row, settings: Settings) -> Iterator[tuple[He
         elif row.name == "source picture":
             yield heldout, list(case.view.rgb[torch.from_numpy(heldout.frames)].numpy())
         else:
-            yield heldout, list(warped_pictures(case, known.priors, known.empty, heldout))
+            yield heldout, list(warped_pictures(case, prepared.priors, prepared.empty, heldout))
 
 
-def measured(known: Prepared, row: Row, settings: Settings) -> dict[str, Any]:
+def measured(prepared: Prepared, row: Row, settings: Settings) -> dict[str, Any]:
     """A row's figures on one case."""
     start = time.process_time()
     scores: dict[str, list[float]] = {"all": [], "moving": [], "disoccluded": []}
-    for heldout, shown in pictures(known, row, settings):
+    for heldout, shown in pictures(prepared, row, settings):
         for i, picture in enumerate(shown):
             seen = heldout.seen[i]
             masks = {"all": seen > 0, "moving": (seen > 0) & heldout.moving[i], "disoccluded": seen == 1}
             for name, mask in masks.items():
                 if mask.any():
                     scores[name].append(masked_psnr_db(picture, heldout.rgb[i], mask))
-    found = {name: round(float(np.mean(values)), 3) for name, values in scores.items()}
-    case = known.case
+    means = {name: round(float(np.mean(values)), 3) for name, values in scores.items()}
+    case = prepared.case
     priors = "own" if case.truth is None else "true"
     place = {"scene": case.name, "seed": case.seed, "priors": priors, "row": row.name}
-    return place | found | {"cpu_s": round(time.process_time() - start, 1)}
+    return place | means | {"cpu_s": round(time.process_time() - start, 1)}
 
 
 def cases(options: argparse.Namespace, settings: Settings) -> Iterator[tuple[str, int, Any]]:
@@ -232,13 +237,13 @@ def run(options: argparse.Namespace, settings: Settings) -> None:
         rows = [row for row in ROWS if row.name in options.rows and (name, seed, row.name) not in done]
         if not rows:
             continue
-        known = prepared(make())
+        prepared = prepare(make())
         for row in rows:
-            found = measured(known, row, settings)
-            figures.append(found)
+            result = measured(prepared, row, settings)
+            figures.append(result)
             content = {"settings": asdict(settings), "figures": figures}
             write_whole(options.json, (json.dumps(content, indent=1) + "\n").encode())
-            print("  ".join(f"{value}" for value in found.values()), flush=True)
+            print("  ".join(f"{value}" for value in result.values()), flush=True)
 
 
 def words(text: str) -> list[str]:
@@ -248,15 +253,15 @@ def words(text: str) -> list[str]:
 def main(arguments: list[str]) -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kinds", type=words, default=["all", "sheet", "push", "lid"], help="of made-up scenes")
+    parser.add_argument("--kinds", type=words, default=["all", "sheet", "push", "lid"], help="of synthetic scenes")
     parser.add_argument("--seeds", type=lambda text: [int(word) for word in words(text)], default=[0, 1, 2])
     parser.add_argument("--sim", type=Path, help="folder of simulated episodes (docs/evaluate.md)")
     parser.add_argument("--scenes", type=words, default=["rigid_push", "pick_place", "deformable", "free_arm"])
-    parser.add_argument("--true_priors", action="store_true", help="true masks and tracks, of made-up scenes alone")
+    parser.add_argument("--true_priors", action="store_true", help="true masks and tracks, of synthetic scenes alone")
     names = [row.name for row in ROWS]
     parser.add_argument("--rows", type=lambda text: text.split(";"), default=names, help="; between them")
     parser.add_argument("--json", type=Path, default=JSON)
-    parser.add_argument("--report", action="store_true", help="print the table of the figures, and draw them")
+    parser.add_argument("--report", action="store_true", help="print the table of the figures, and plot them")
     for name, value in asdict(Settings()).items():
         parser.add_argument(f"--{name}", type=int, default=value)
     options = parser.parse_args(arguments)
@@ -264,7 +269,7 @@ def main(arguments: list[str]) -> None:
     settings = Settings(**{name: getattr(options, name) for name in asdict(Settings())})
     if options.report:
         figures = read(options.json, settings)
-        print(drawn_table(figures, options.scenes), scene_table(figures), sep="\n\n")
+        print(overview_table(figures, options.scenes), scene_table(figures), sep="\n\n")
         write_whole(PLOT, plot(figures, options.scenes).encode())
     else:
         with torch_on_one_thread():

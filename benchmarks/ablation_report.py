@@ -8,24 +8,24 @@ from typing import Any
 MEASURES = ("all", "moving", "disoccluded")
 REFERENCE = "L1-L3"  # with which every row is compared, case by case
 LINE_PX, LEFT_PX, WIDTH_PX, TOP_PX, MARGIN_PX = 24, 205, 720, 46, 22
-MADE_UP, SIMULATED = "#1f5fa8", "#c8641b"
+SYNTHETIC, SIMULATED = "#1f5fa8", "#c8641b"
 
 Figures = Sequence[dict[str, Any]]
 
 
-def drawn_table(figures: Figures, simulated: Iterable[str]) -> str:
-    """A Markdown table: made-up scenes by the median over seeds of the mean over kinds, simulated ones by their mean.
+def overview_table(figures: Figures, simulated: Iterable[str]) -> str:
+    """A Markdown table: synthetic scenes by the median over seeds of the mean over kinds, simulated ones by their mean.
 
     Behind the medians stand the least and the largest of the seeds.
     """
     simulated, figures = set(simulated), _own(figures)
-    made_up = [one for one in figures if one["scene"] not in simulated]
+    synthetic = [one for one in figures if one["scene"] not in simulated]
     others = [one for one in figures if one["scene"] in simulated]
-    kinds, seeds = _values(made_up, "scene"), _values(made_up, "seed")
-    head = [f"made-up: {name}" for name in MEASURES] + [f"simulated: {name}" for name in MEASURES] * bool(others)
+    kinds, seeds = _values(synthetic, "scene"), _values(synthetic, "seed")
+    head = [f"synthetic: {name}" for name in MEASURES] + [f"simulated: {name}" for name in MEASURES] * bool(others)
     lines = [f"| | {' | '.join(head)} |", "|---" * (len(head) + 1) + "|"]
     for row in _values(figures, "row"):
-        cells = [_over_seeds(made_up, row, name, kinds, seeds) for name in MEASURES]
+        cells = [_over_seeds(synthetic, row, name, kinds, seeds) for name in MEASURES]
         cells += [_mean(others, row, name, _values(others, "scene")) for name in MEASURES] if others else []
         lines.append(f"| {row} | {' | '.join(cells)} |")
     return "\n".join(lines)
@@ -40,7 +40,7 @@ def scene_table(figures: Figures) -> str:
             [one["moving"] for one in figures if (one["row"], one["scene"], one["priors"]) == (row, *scene)]
             for scene in scenes
         )
-        lines.append(f"| {row} | {' | '.join(f'{median(some):.2f}' if some else '' for some in values)} |")
+        lines.append(f"| {row} | {' | '.join(f'{median(cell):.2f}' if cell else '' for cell in values)} |")
     return "\n".join(lines)
 
 
@@ -56,7 +56,7 @@ def plot(figures: Figures, simulated: Iterable[str]) -> str:
         ]
         for row in _values(figures, "row")
     }
-    every = [gain for some in gains.values() for gain, _ in some]
+    every = [gain for cases in gains.values() for gain, _ in cases]
     low, high = min(0, int(min(every)) - 1), int(max(every)) + 1
     height = TOP_PX + LINE_PX * len(gains) + MARGIN_PX
 
@@ -68,8 +68,8 @@ def plot(figures: Figures, simulated: Iterable[str]) -> str:
         f'font-size="12"><rect width="{WIDTH_PX}" height="{height}" fill="white"/>',
         f'<text x="{LEFT_PX}" y="16">PSNR over moving pixels less that of {REFERENCE}, dB; one dot per case, '
         "bar: median</text>",
-        f'<circle cx="8" cy="12" r="4" fill="{MADE_UP}"/><text x="16" y="16">made-up</text>',
-        f'<circle cx="84" cy="12" r="4" fill="{SIMULATED}"/><text x="92" y="16">simulated</text>',
+        f'<circle cx="8" cy="12" r="4" fill="{SYNTHETIC}"/><text x="16" y="16">synthetic</text>',
+        f'<circle cx="88" cy="12" r="4" fill="{SIMULATED}"/><text x="96" y="16">simulated</text>',
     ]
     for tick in range(low, high + 1):
         parts.append(
@@ -77,15 +77,15 @@ def plot(figures: Figures, simulated: Iterable[str]) -> str:
             f'stroke="{"#555" if tick == 0 else "#ddd"}"/><text x="{x(tick):.1f}" y="{TOP_PX - 12}" '
             f'text-anchor="middle">{tick:+d}</text>'
         )
-    for number, (row, some) in enumerate(gains.items()):
+    for number, (row, cases) in enumerate(gains.items()):
         y = TOP_PX + LINE_PX * (number + 0.5)
         parts.append(f'<text x="{LEFT_PX - 8}" y="{y + 4:.1f}" text-anchor="end">{escape(row)}</text>')
         parts += [
-            f'<circle cx="{x(gain):.1f}" cy="{y:.1f}" r="3.5" fill="{SIMULATED if sim else MADE_UP}" opacity="0.7"/>'
-            for gain, sim in some
+            f'<circle cx="{x(gain):.1f}" cy="{y:.1f}" r="3.5" fill="{SIMULATED if sim else SYNTHETIC}" opacity="0.7"/>'
+            for gain, sim in cases
         ]
-        if some:
-            middle = x(median(gain for gain, _ in some))
+        if cases:
+            middle = x(median(gain for gain, _ in cases))
             parts.append(
                 f'<line x1="{middle:.1f}" x2="{middle:.1f}" y1="{y - 9:.1f}" y2="{y + 9:.1f}" stroke="black" '
                 'stroke-width="2"/>'
@@ -107,9 +107,9 @@ def _over_seeds(figures: Figures, row: str, name: str, kinds: list[str], seeds: 
     """Median over the seeds of which all kinds are known, the least and the largest; of one seed its value alone."""
     means = []
     for seed in seeds:
-        some = [one[name] for one in figures if one["row"] == row and one["seed"] == seed]
-        if len(some) == len(kinds):
-            means.append(sum(some) / len(some))
+        values = [one[name] for one in figures if one["row"] == row and one["seed"] == seed]
+        if len(values) == len(kinds):
+            means.append(sum(values) / len(values))
     if len(means) < 2:
         return "".join(f"{value:.2f} (one seed)" for value in means)
     return f"{median(means):.2f} ({min(means):.2f} to {max(means):.2f})"
@@ -117,5 +117,5 @@ def _over_seeds(figures: Figures, row: str, name: str, kinds: list[str], seeds: 
 
 def _mean(figures: Figures, row: str, name: str, scenes: list[str]) -> str:
     """Mean over the scenes, if all are known."""
-    some = [one[name] for one in figures if one["row"] == row]
-    return f"{sum(some) / len(some):.2f}" if len(some) == len(scenes) else ""
+    values = [one[name] for one in figures if one["row"] == row]
+    return f"{sum(values) / len(values):.2f}" if len(values) == len(scenes) else ""

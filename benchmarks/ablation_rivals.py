@@ -1,7 +1,7 @@
 """What the ablation compares with that the library does not have: pictures warped by depth, and learned motion."""
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import cv2
@@ -14,8 +14,6 @@ from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.geometry import project, transform_points, unproject_image
-from lerobot_msdyn.motion.field import DeformationField
-from lerobot_msdyn.motion.model.bases import MotionLevel
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.reconstruction.background import EmptyScene
 from lerobot_msdyn.scene.dynamic import DynamicScene
@@ -38,9 +36,9 @@ def warped_pictures(
     for i, frame in enumerate(heldout.frames.tolist()):
         target, source = heldout.camera.select([i]), recorded.select([frame])
         colours, weight = closed(*splat(case.view.rgb[frame], priors.depth[frame], source, target))
-        behind, known = splat(empty.rgb, torch.where(empty.seen > 0, empty.depth, 0.0), source, target)
-        taken = (weight <= LEAST_WEIGHT) & (known > LEAST_WEIGHT)
-        colours[taken], weight[taken] = behind[taken], known[taken]
+        behind, density = splat(empty.rgb, torch.where(empty.seen > 0, empty.depth, 0.0), source, target)
+        taken = (weight <= LEAST_WEIGHT) & (density > LEAST_WEIGHT)
+        colours[taken], weight[taken] = behind[taken], density[taken]
         holes = (weight <= LEAST_WEIGHT).astype(np.uint8)
         yield cv2.inpaint(colours.clip(0, 255).round().astype(np.uint8), holes, FILL_RADIUS_PX, cv2.INPAINT_TELEA)
 
@@ -55,18 +53,18 @@ def splat(rgb: UInt8[Tensor, "h w 3"], depth: Float[Tensor, "h w"], source: Came
     low = at.floor()
     corner = torch.tensor([[0, 0], [1, 0], [0, 1], [1, 1]])
     cells = low.long()[:, None] + corner
-    share = (1 - (at[:, None] - low[:, None] - corner).abs()).prod(-1)
+    overlap = (1 - (at[:, None] - low[:, None] - corner).abs()).prod(-1)
     inside = ((cells >= 0) & (cells < torch.tensor([width, height]))).all(-1)
     point, which = inside.nonzero(as_tuple=True)
     cell = cells[point, which, 1] * width + cells[point, which, 0]
-    share, z = share[point, which], z[point]
+    overlap, z = overlap[point, which], z[point]
     nearest = torch.full((height * width,), torch.inf)
-    sure = share > LEAST_WEIGHT
+    sure = overlap > LEAST_WEIGHT
     nearest.scatter_reduce_(0, cell[sure], z[sure], "amin")
     shown = z < nearest[cell] * (1 + SAME_SURFACE) + SAME_SURFACE_M
-    cell, share, point = cell[shown], share[shown], point[shown]
-    weight = torch.zeros(height * width).index_add_(0, cell, share)
-    total = torch.zeros(height * width, 3).index_add_(0, cell, share[:, None] * values[point])
+    cell, overlap, point = cell[shown], overlap[shown], point[shown]
+    weight = torch.zeros(height * width).index_add_(0, cell, overlap)
+    total = torch.zeros(height * width, 3).index_add_(0, cell, overlap[:, None] * values[point])
     colours = total / weight.clamp(min=1e-9)[:, None]
     return colours.reshape(height, width, 3).numpy(), weight.reshape(height, width).numpy()
 
@@ -91,24 +89,25 @@ def with_learned_motion(
 
     `afresh`: a deformation field begins without any motion (Yang et al. 2024, Deformable 3D Gaussians).
     """
+    rates_of = {
+        "bases": {"rotations_6d": TURN_RATE, "displacements": SHIFT_RATE * distance},
+        "field": dict.fromkeys(("first", "hidden", "biases", "last"), FIELD_RATE),
+    }
     levels, groups = [], []
     for level in scene.levels:
-        if isinstance(level, MotionLevel):
-            rates = {"rotations_6d": TURN_RATE, "displacements": SHIFT_RATE * distance}
-        else:
-            rates = dict.fromkeys(("first", "hidden", "biases", "last"), FIELD_RATE)
-            level = replace(level, last=torch.zeros_like(level.last)) if afresh else level
-        leaves = {name: getattr(level, name).clone().requires_grad_() for name in rates}
-        groups += [{"params": [leaf], "lr": rates[name]} for name, leaf in leaves.items()]
+        rates = rates_of[level.kind]
+        leaves = {name: getattr(level, name).clone() for name in rates}
+        if afresh:
+            leaves["last"].zero_()
+        groups += [{"params": [leaf.requires_grad_()], "lr": rates[name]} for name, leaf in leaves.items()]
         levels.append(replace(level, **leaves))
     return replace(scene, levels=tuple(levels)), groups
 
 
 def with_fixed_motion(scene: DynamicScene) -> DynamicScene:
     """The same scene after the fit: nothing is learned any more."""
-
-    def fixed(level: MotionLevel | DeformationField) -> MotionLevel | DeformationField:
-        tensors = {name: value for name, value in vars(level).items() if isinstance(value, Tensor)}
-        return replace(level, **{name: value.detach() for name, value in tensors.items()})
-
-    return replace(scene, levels=tuple(fixed(level) for level in scene.levels))
+    levels = (
+        replace(level, **{item.name: getattr(level, item.name).detach() for item in fields(level)})
+        for level in scene.levels
+    )
+    return replace(scene, levels=tuple(levels))

@@ -1,4 +1,4 @@
-"""Scenes with true held-out views for the ablation: made-up ones, and simulated episodes (docs/evaluate.md)."""
+"""Scenes with true held-out views for the ablation: synthetic ones, and simulated episodes (docs/evaluate.md)."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,7 +52,7 @@ class Case:
 
 
 def synthetic_case(kind: str, seed: int, frames: int, width: int, every: int, *, true_priors: bool = False) -> Case:
-    """A made-up scene of 4:3, its pictures as they are rendered (no codec); every `every`-th frame has truth."""
+    """A synthetic scene of 4:3, its pictures as they are rendered (no codec); every `every`-th frame has truth."""
     scene = make_scene(kind, seed, frames, width, width * 3 // 4)
     recorded = scene.render(scene.camera)
     times = np.arange(every // 2, frames, every)

@@ -7,7 +7,7 @@
   are. `dense` is the same call where every Gaussian names all bases of each level, `matrix` the same again with the
   mixture written as a product of matrices. All are run in turn in one process, on one thread; the figures are medians
   of its processor time, which ignores being descheduled. Gradients go to means, logits, rotations and displacements.
-* `tracks`: three made-up bodies (3,000 tracks, 60 frames, 2 mm noise, 35 % missing, gaps besides), per set of levels
+* `tracks`: three synthetic bodies (3,000 tracks, 60 frames, 2 mm noise, 35 % missing, gaps besides), per set of levels
   and with and without the gate. The error is that of the true canonical points carried to every frame.
 * `sim`: simulated episodes in FOLDER (see simulated.py), initialised from true tracks with noise and 30 % of their
   positions dropped. The error is that of other points, predicted in all frames where they are seen from one of them:
@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from unittest.mock import patch
 
+import rivals
 import torch
 from simulated import OBJECT, ROBOT, Simulated, dense_tracks, instance_of, observed, read_simulated
 from torch import Tensor
@@ -33,11 +34,11 @@ from lerobot_msdyn.motion.estimate import motion_from_tracks, scene_motion
 from lerobot_msdyn.motion.from_tracks.lift import LiftedTracks
 from lerobot_msdyn.motion.model import bases
 from lerobot_msdyn.motion.model.bases import COARSEST, MotionLevel, level_from_motions, with_idle
-from lerobot_msdyn.motion.model.binding import bind
 from lerobot_msdyn.motion.model.compose import compose
-from lerobot_msdyn.motion.model.scene_motion import SceneMotion
+from lerobot_msdyn.motion.model.scene_motion import SceneMotion, bind
 from lerobot_msdyn.synthetic.bodies import BODY_KINDS, TrackedBody, tracked_body
 
+rivals.register()
 HIERARCHY = ("object", "primitive", "grain")
 OBJECTS, PRIMITIVES, GRAINS = 3, 5, 10  # of the scene, of an object, of a primitive
 FRAMES = 60
@@ -183,7 +184,7 @@ def track_error(motion: SceneMotion, body: TrackedBody, points: Tensor) -> float
 
 
 def track_scenes(tracks: int, frames: int, gate: str, variants: list[MotionConfig]) -> Iterator[dict]:
-    """Errors of the made-up bodies."""
+    """Errors of the synthetic bodies."""
     for kind in BODY_KINDS:
         body = tracked_body(kind, tracks=tracks, frames=frames)
         seen = LiftedTracks(
@@ -280,7 +281,7 @@ def main(words: list[str] | None = None) -> None:
     if only in (None, "tracks"):
         tracks, frames, variants = (60, 8, hierarchies[:2]) if quick else (3000, 60, list(VARIANTS))
         rows = track_scenes(tracks, frames, arguments.gate or "both", variants)
-        report["errors"] = printed("made-up bodies", rows)
+        report["errors"] = printed("synthetic bodies", rows)
     if arguments.sim and only in (None, "sim"):
         tracks, variants = (400, hierarchies[:1]) if quick else (4000, hierarchies)
         report["sim"] = []

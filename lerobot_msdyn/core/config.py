@@ -6,16 +6,23 @@ overridden by a flag of the same dotted name, e.g. `--fit.steps 1000`.
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from lerobot_msdyn.core.fields import INFINITY, MAX_SEED, between, numbers_of, one_of
+import draccus
+
+from lerobot_msdyn.core.errors import ConfigError, one_line
+from lerobot_msdyn.core.fields import INFINITY, MAX_SEED, between, numbers_of, one_of, problems
 from lerobot_msdyn.core.perturbation import Perturbation
 from lerobot_msdyn.core.registries import LOSSES
+from lerobot_msdyn.core.registry import Registry
 
 # Named: draccus finds the comment above a field only where its annotation holds no quotes.
 Device = Literal["auto", "cpu", "cuda"]
 Fill = Literal["inpaint", "nearest", "none"]
-LevelName = Literal["object", "primitive", "grain", "particle", "flat", "field"]
+MOTION_LEVELS: Registry[Any] = Registry("motion level", "lerobot_msdyn.motion.levels")
+_LEVELS = ["object", "primitive", "grain"]
+# Motion levels of other systems, which are not the package's own -> the plugin that registers each.
+RIVAL_LEVELS = {"flat": "benchmarks/rivals/flat.py", "field": "benchmarks/rivals/field.py"}
 
 
 @dataclass
@@ -84,49 +91,82 @@ class SceneConfig:
 
 
 @dataclass
-class FramesPerKnot:
-    """Frames from one knot of a motion to the next; between them it is interpolated."""
-
-    # Objects.
-    object: int = between(1, 1, 1000)
-    # Primitives.
-    primitive: int = between(2, 1, 1000)
-    # Grains.
-    grain: int = between(4, 1, 1000)
-    # Particles.
-    particle: int = between(4, 1, 1000)
-
-
-@dataclass
 class MotionConfig:
     """The levels of motion."""
 
-    # Coarse to fine: object, then any of primitive, grain, particle; or flat or field alone: other systems' models.
-    levels: list[LevelName] = field(default_factory=lambda: ["object", "primitive", "grain"])
+    # Coarse to fine: object, then any of primitive, grain (after primitive) and particle in this order, and levels of
+    # your own that --plugins registers (docs/extending.md).
+    levels: list[str] = field(default_factory=lambda: list(_LEVELS))
     # Rigid parts per moving instance at the object level (a robot arm is one instance with several parts).
     max_parts: int = between(6, 1, 64)
     # Primitives per rigid part.
     primitives: int = between(5, 1, 1000)
     # Grains per primitive.
     grains: int = between(10, 1, 1000)
-    # Particles in the whole scene.
+    # Particles per rigid part.
     particles: int = between(512, 1, 100_000)
-    # Bases of the flat model in the whole scene.
-    flat_bases: int = between(10, 1, 10_000)
     # Keep a finer level, part by part, only where it predicts tracks better that it was not fitted to.
     gate: bool = True
     # Find the rigid parts and their poses by the recorded depth, colours and outlines; only where depth is metric.
     register: bool = True
-    frames_per_knot: FramesPerKnot = field(default_factory=FramesPerKnot)
+    # By level: frames from one knot of its motion to the next; between them it is interpolated. Without: object 1,
+    # primitive 2, grain 4, particle 4.
+    frames_per_knot: dict[str, int] = numbers_of({}, 1, 1000, registry=MOTION_LEVELS)  # it is a field
+    # By level: the settings of levels of your own.
+    settings: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    def settings_of[S](self, level: str, kind: type[S]) -> S:
+        """A level's own settings: a dataclass of that kind with what `settings` holds for the level.
+
+        Raises:
+            ConfigError: it holds something that the dataclass does not have, or of another type.
+        """
+        try:
+            return draccus.decode(kind, self.settings.get(level, {}))
+        except draccus.utils.DraccusException as error:
+            raise ConfigError(f"settings.{level}: {one_line(error)}") from error
 
     def problems(self) -> list[str]:
         """What is wrong between fields."""
-        if _is_hierarchy(self.levels):
-            return []
-        return [
-            f"levels is [{', '.join(self.levels)}]; expected [object], then any of primitive, grain (after "
-            "primitive) and particle in this order; or [flat] or [field] alone"
-        ]
+        known, listed = MOTION_LEVELS.names(), f"levels is [{', '.join(self.levels)}]"
+        lines = [f"{listed}; {_unknown_level(name, known)}" for name in self.levels if name not in known]
+        lines += [f"settings.{name}: {_unknown_level(name, known)}" for name in self.settings if name not in known]
+        if lines or (self.levels == _LEVELS and not self.settings):
+            return lines  # the default is right: nothing needs to be imported to tell
+        return [*self._order_problems(listed), *self._settings_problems()]
+
+    def _order_problems(self, listed: str) -> list[str]:
+        if not self.levels:
+            return [f"{listed}; expected at least one level, such as object"]
+        for coarser, name in zip(["", *self.levels], self.levels, strict=False):
+            after = MOTION_LEVELS.get(name).after
+            if coarser and coarser not in after and name not in MOTION_LEVELS.get(coarser).before:
+                return [f"{listed}; expected {name} {_place(after)}, not after {coarser}"]
+            if not coarser and after:
+                return [f"{listed}; expected {name} {_place(after)}"]
+        return []
+
+    def _settings_problems(self) -> list[str]:
+        lines = []
+        for name in self.settings:
+            kind = MOTION_LEVELS.get(name).settings
+            if kind is None:
+                lines.append(f"settings.{name}: level {name} has no settings of its own")
+                continue
+            try:
+                lines += problems(self.settings_of(name, kind), f"settings.{name}.")
+            except ConfigError as error:
+                lines.append(str(error))
+        return lines
+
+
+def _place(after: tuple[str, ...]) -> str:
+    return f"right after {' or '.join(after)}" if after else "in the first place"
+
+
+def _unknown_level(name: str, known: list[str]) -> str:
+    file = RIVAL_LEVELS.get(name, "FILE.py, if it is your own")
+    return f"expected some of {', '.join(known)}; {name} is none of them: add --plugins {file}"
 
 
 @dataclass
@@ -233,13 +273,3 @@ class Recipe:
         """Whether a prior is for a whole video: exchange files, and the poses of a moving camera."""
         sources = (self.priors.depth, self.priors.masks, self.priors.tracks, self.camera.poses)
         return self.camera.poses == "sfm" or any(source.endswith(".npz") for source in sources)
-
-
-def _is_hierarchy(levels: list[LevelName]) -> bool:
-    """Whether levels go from coarse to fine, each with what carries it."""
-    order = ("object", "primitive", "grain", "particle")
-    if levels in (["flat"], ["field"]):
-        return True
-    fine = list(levels[1:])
-    ascending = fine == [name for name in order[1:] if name in fine]
-    return levels[:1] == ["object"] and ascending and ("grain" not in fine or "primitive" in fine)

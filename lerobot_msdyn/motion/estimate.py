@@ -1,5 +1,6 @@
 """From tracks to the motion of a scene: lift, canonical frame, rigid parts, then one level after the other."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import cast
 
@@ -8,13 +9,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.core.config import LevelName, MotionConfig
+from lerobot_msdyn.core.config import MotionConfig
+from lerobot_msdyn.core.errors import ConfigError
+from lerobot_msdyn.core.fields import problems
 from lerobot_msdyn.core.geometry import transform_points
 from lerobot_msdyn.core.observations import PointTracks
-from lerobot_msdyn.motion.field import fit_field
-from lerobot_msdyn.motion.finer.add_level import add_level
+from lerobot_msdyn.motion.finer.add_level import Approve, add_level
 from lerobot_msdyn.motion.finer.residual import ResidualTracks, pull_back
-from lerobot_msdyn.motion.flat import fit_flat
 from lerobot_msdyn.motion.from_tracks.lift import LiftedTracks, lift_tracks, position_noise
 from lerobot_msdyn.motion.from_tracks.objects import canonical_frame, initialise_objects
 from lerobot_msdyn.motion.from_tracks.outliers import coherence
@@ -22,6 +23,7 @@ from lerobot_msdyn.motion.from_tracks.parts import split_rigid_parts
 from lerobot_msdyn.motion.model.bases import MotionLevel
 from lerobot_msdyn.motion.model.compose import Level
 from lerobot_msdyn.motion.model.scene_motion import SceneMotion
+from lerobot_msdyn.motion.spec import FirstLevel, PartTracks, first_level, frames_per_knot
 from lerobot_msdyn.motion.to_video.register import Recording
 
 _MIN_SEEN = 3  # frames, and 5 % of the clip, in which a track must be seen
@@ -63,8 +65,71 @@ def scene_motion(
 
 
 def motion_from_tracks(tracks: LiftedTracks, config: MotionConfig, recording: Recording | None = None) -> SceneMotion:
-    """All levels of motion (the paper's section on initialisation; docs/method.md), from at least one track."""
-    noise = position_noise(tracks.xyz, tracks.valid)
+    """All levels of motion (the paper's section on initialisation; docs/method.md), from at least one track.
+
+    Raises:
+        ConfigError: the levels cannot stand in this order, or a setting is not allowed.
+    """
+    wrong = problems(config, "motion.")
+    if wrong:
+        raise ConfigError("; ".join(wrong))
+    first = first_level(config.levels[0])
+    parts = rigid_parts(tracks, config)
+    registered = parts
+    if recording is not None and first.by_video and bool(_bases(parts).active.any()):
+        registered = recording.register(parts, config)
+    if registered is parts:
+        recording = None  # finer levels are judged by tracks alone
+    given = PartTracks(
+        _bases(registered),
+        parts.points,
+        parts.part if recording is None else _parts_of(registered, tracks),
+        tracks.xyz,
+        torch.where(tracks.valid, tracks.confidence.square(), 0.0),
+        parts.canonical_frame,
+        position_noise(tracks.xyz, tracks.valid),
+    )
+    levels = (first.estimate(given, config),)
+    motion = SceneMotion((config.levels[0],), levels, parts.canonical_frame, parts.points, given.part, tracks.instance)
+
+    def by_video(so_far: SceneMotion, name: str) -> Approve | None:
+        if recording is None:
+            return None
+        return recording.approval(replace(registered, names=so_far.names, levels=so_far.levels), name)
+
+    if len(config.levels) > 1:
+        left = _left_by(first, levels[0], given, tracks.valid)
+        motion = _with_finer_levels(motion, left, tracks, config, given.noise, by_video)
+    if recording is None:
+        return motion
+    return recording.guided(replace(registered, names=motion.names, levels=motion.levels))
+
+
+def _with_finer_levels(
+    motion: SceneMotion,
+    left: ResidualTracks,
+    tracks: LiftedTracks,
+    config: MotionConfig,
+    noise: float,
+    by_video: Callable[[SceneMotion, str], Approve | None],
+) -> SceneMotion:
+    """The motion with all levels that the config names; `left` are the tracks as the first one leaves them."""
+    for name in config.levels[1:]:
+        so_far = replace(motion, points=left.points)
+        level, left = add_level(name, left, tracks, so_far, config, noise, by_video(motion, name))
+        motion = SceneMotion(
+            (*motion.names, name),
+            (*motion.levels, level),
+            motion.canonical_frame,
+            _usual_positions(left.positions, left.weights, noise),
+            motion.part,
+            motion.instance,
+        )
+    return motion
+
+
+def rigid_parts(tracks: LiftedTracks, config: MotionConfig) -> SceneMotion:
+    """The rigid parts of all instances, and their motions, by tracks alone: an object level."""
     canonical = canonical_frame(tracks.valid, tracks.instance)
     part = split_rigid_parts(
         tracks.xyz, tracks.valid, tracks.confidence, tracks.instance, config.max_parts, tracks.pixel_m
@@ -76,36 +141,30 @@ def motion_from_tracks(tracks: LiftedTracks, config: MotionConfig, recording: Re
         part,
         canonical,
         still_m=_STILL_PX * tracks.pixel_m,
-        frames_per_knot=config.frames_per_knot.object,
+        frames_per_knot=frames_per_knot("object", config),
     )
-    by_tracks = registered = SceneMotion(("object",), (objects,), canonical, points, part, tracks.instance)
-    if recording is not None and config.levels[0] == "object" and bool(objects.active.any()):
-        registered = recording.register(by_tracks, config)
-    if registered is not by_tracks:
-        objects = cast(MotionLevel, registered.levels[0])
-        part = _parts_of(registered, tracks)
-    weights = torch.where(tracks.valid, tracks.confidence.square(), 0.0)
-    names, levels = _first_level(config, objects, points, tracks.xyz, weights, canonical, noise)
-    positions = pull_back(objects, part[:, None], torch.zeros(len(part), 1), tracks.xyz)
-    start = near_canonical(positions, weights, canonical)
-    weights = weights * coherence(start, positions, tracks.valid, part, noise)
-    left = ResidualTracks(near_canonical(positions, weights, canonical), positions, weights, part, part)
-    for name in config.levels[1:]:
-        so_far = SceneMotion(names, levels, canonical, left.points, part, tracks.instance)
-        approve = None
-        if recording is not None and registered is not by_tracks:
-            approve = recording.approval(replace(registered, names=names, levels=levels), name)
-        level, left = add_level(name, left, tracks, so_far, config, noise, approve)
-        names, levels = (*names, name), (*levels, level)
-        points = _usual_positions(left.positions, weights, noise)
-    if recording is not None and registered is not by_tracks:
-        return recording.guided(replace(registered, names=names, levels=levels))
-    return SceneMotion(names, levels, canonical, points, part, tracks.instance)
+    return SceneMotion(("object",), (objects,), canonical, points, part, tracks.instance)
+
+
+def _bases(parts: SceneMotion) -> MotionLevel:
+    return cast(MotionLevel, parts.levels[0])
+
+
+def _left_by(first: FirstLevel, level: Level, given: PartTracks, valid: Bool[Tensor, "n t"]) -> ResidualTracks:
+    """The tracks as the first level leaves them; those that do not keep with their part count less."""
+    if not isinstance(level, MotionLevel):
+        raise ConfigError(f"a motion level of kind {level.kind!r} has no bases that a finer level could refine")
+    indices, logits = first.bind(level, given.points, given.part, None)
+    positions = pull_back(level, indices, logits, given.xyz)
+    start = near_canonical(positions, given.weights, given.canonical)
+    weights = given.weights * coherence(start, positions, valid, given.part, given.noise)
+    owner = indices.gather(1, logits.argmax(1, keepdim=True))[:, 0]
+    return ResidualTracks(near_canonical(positions, weights, given.canonical), positions, weights, given.part, owner)
 
 
 def _parts_of(motion: SceneMotion, tracks: LiftedTracks) -> Int[Tensor, " n"]:
     """Part of every track, by what is near it where it is seen; no part is left without tracks."""
-    count = len(cast(MotionLevel, motion.levels[0]))
+    count = len(_bases(motion))
     votes = torch.zeros(len(tracks.xyz), count)
     at_canonical = torch.zeros(len(tracks.xyz), 3)
     seen = tracks.valid.cumsum(1)
@@ -121,23 +180,6 @@ def _parts_of(motion: SceneMotion, tracks: LiftedTracks) -> Int[Tensor, " n"]:
         if len(own) and not bool((part == k).any()):
             part[(at_canonical - own.mean(0)).norm(dim=-1).argmin()] = k
     return part
-
-
-def _first_level(
-    config: MotionConfig,
-    objects: MotionLevel,
-    points: Float[Tensor, "n 3"],
-    xyz: Float[Tensor, "n t 3"],
-    weights: Float[Tensor, "n t"],
-    canonical: int,
-    noise: float,
-) -> tuple[tuple[LevelName, ...], tuple[Level, ...]]:
-    """The coarsest level: objects, or one of the two models of other systems, given the same canonical points."""
-    if config.levels[0] == "flat":
-        return ("flat",), (fit_flat(points, xyz, weights, config.flat_bases, canonical, noise),)
-    if config.levels[0] == "field":
-        return ("field",), (fit_field(points, xyz, weights),)
-    return ("object",), (objects,)
 
 
 def _usual_positions(

@@ -15,6 +15,7 @@ from torch import Tensor
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.core.sampling import evenly, scaled_px, scaled_window
+from lerobot_msdyn.core.serialise import from_named_tensors, named_tensors
 from lerobot_msdyn.priors.depth.flying_pixels import clean_recorded_depth
 from lerobot_msdyn.priors.masks.moving import temporal_median
 from lerobot_msdyn.reconstruction.background import MARGIN_PX, SAMPLES, EmptyScene, empty_scene
@@ -190,19 +191,15 @@ def shift_px(picture: UInt8[ndarray, "h w 3"], other: UInt8[ndarray, "i j 3"]) -
 
 def as_arrays(background: SharedBackground) -> dict[str, ndarray]:
     """A background for a file, without its frames and camera."""
-    tensors = dict(vars(background.empty))
-    if background.static is not None:
-        tensors |= {f"static.{name}": tensor for name, tensor in vars(background.static).items()}
+    tensors = named_tensors(background.empty) | named_tensors(background.static, "static")
     return {name: tensor.numpy() for name, tensor in tensors.items()}
 
 
 def from_arrays(arrays: dict[str, ndarray], camera: CameraTrack, frames: UInt8[Tensor, "m h w 3"]) -> SharedBackground:
     """What `as_arrays` gave, with its frames and camera."""
     tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
-    empty = EmptyScene(*(tensors[item.name] for item in fields(EmptyScene)))
-    if "static.means" not in tensors:
-        return SharedBackground(empty, camera, frames)
-    static = Gaussians(*(tensors[f"static.{item.name}"] for item in fields(Gaussians)))
+    empty = from_named_tensors(EmptyScene, tensors)
+    static = from_named_tensors(Gaussians, tensors, "static") if "static.means" in tensors else None
     return SharedBackground(empty, camera, frames, static)
 
 

@@ -1,12 +1,13 @@
 """A scene of a static and a moving set of Gaussians, and what it holds at a time."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from lerobot_msdyn.core.geometry import quaternion_conjugate, quaternion_multiply, quaternion_to_matrix
+from lerobot_msdyn.core.serialise import named_tensors
 from lerobot_msdyn.motion.model.compose import Level, compose
 from lerobot_msdyn.scene.gaussians import Gaussians, shaded
 from lerobot_msdyn.scene.overlay import PATCH_OPACITY, FramePatch, Overlay
@@ -90,17 +91,9 @@ class DynamicScene:
 
     def tensors(self) -> dict[str, Tensor]:
         """All that the scene is made of, by the names of its file."""
-        tensors: dict[str, Tensor] = {}
-        if self.shading is not None:
-            tensors |= {f"shading.{item.name}": getattr(self.shading, item.name) for item in fields(Shading)}
-        if self.overlay is not None:
-            tensors |= {f"overlay.{item.name}": getattr(self.overlay, item.name) for item in fields(Overlay)}
-        for name, part in (("static", self.static), ("moving", self.moving)):
-            tensors |= {f"{name}.{item.name}": getattr(part, item.name) for item in fields(part)}
-        for i, level in enumerate(self.levels):
-            tensors |= {f"levels.{i}.{item.name}": getattr(level, item.name) for item in fields(level)}
-            tensors |= {f"levels.{i}.indices": self.indices[i], f"levels.{i}.logits": self.logits[i]}
-        return tensors
+        sets = {"static": self.static, "moving": self.moving, "shading": self.shading, "overlay": self.overlay}
+        bindings = [{"indices": index, "logits": row} for index, row in zip(self.indices, self.logits, strict=True)]
+        return named_tensors(sets) | named_tensors(self.levels, "levels") | named_tensors(bindings, "levels")
 
     def _colours(
         self,

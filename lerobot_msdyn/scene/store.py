@@ -3,22 +3,22 @@
 import json
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from jaxtyping import Int
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import load_file
-from safetensors.torch import save as save_tensors
+from safetensors import SafetensorError
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.core.errors import MsdynError
-from lerobot_msdyn.core.files import write_whole, writing
-from lerobot_msdyn.motion.field import DeformationField
+from lerobot_msdyn.core.config import RIVAL_LEVELS
+from lerobot_msdyn.core.errors import ConfigError, MsdynError
+from lerobot_msdyn.core.files import writing
+from lerobot_msdyn.core.serialise import from_named_tensors, named_tensors, read_tensors, write_tensors
 from lerobot_msdyn.motion.model.bases import MotionLevel
+from lerobot_msdyn.motion.spec import level_spec
 from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.gaussians import Gaussians
 from lerobot_msdyn.scene.overlay import Overlay
@@ -27,7 +27,7 @@ from lerobot_msdyn.scene.shading import Shading
 FOLDER = Path("msdyn_scenes")  # inside an output dataset
 FOLDER_SCHEMA = 1  # of the folder of one camera
 SCENE_SCHEMA = 3  # of one scene's file
-LEVEL_KINDS: dict[str, type] = {"bases": MotionLevel, "field": DeformationField}
+_SCENE_HEADER = "lerobot_msdyn"
 _HEADER, _CAMERA, _WINDOW = "scene.json", "camera.safetensors", "window_{:03d}.safetensors"
 
 
@@ -79,10 +79,6 @@ def save(scene: SavedScene, root: Path) -> Path:
     """
     folder = camera_folder(root, scene.source.episode, scene.source.camera)
     partial = folder.with_name(f".{folder.name}.partial")
-    camera = {
-        "intrinsics": scene.camera.intrinsics.contiguous(),
-        "world_from_camera": scene.camera.world_from_camera.contiguous(),
-    }
     header = {
         "schema": FOLDER_SCHEMA,
         "source": asdict(scene.source),
@@ -100,7 +96,7 @@ def save(scene: SavedScene, root: Path) -> Path:
         partial.mkdir(parents=True)
         for number, window in enumerate(scene.windows):
             save_scene(window, partial / _WINDOW.format(number))
-        write_whole(partial / _CAMERA, save_tensors(camera))
+        write_tensors(partial / _CAMERA, named_tensors(scene.camera))
         (partial / _HEADER).write_text(json.dumps(header, indent=1), encoding="utf-8")
         shutil.rmtree(folder, ignore_errors=True)
         partial.rename(folder)
@@ -115,7 +111,7 @@ def load(folder: Path) -> SavedScene:
     """
     header = read_header(folder)
     try:
-        camera = load_file(folder / _CAMERA)
+        camera, _ = read_tensors(folder / _CAMERA)
         track = CameraTrack(
             camera["intrinsics"],
             camera["world_from_camera"],
@@ -188,47 +184,57 @@ def list_scenes(folder: Path) -> dict[int, dict[str, Path]]:
 
 def save_scene(scene: DynamicScene, path: Path) -> None:
     """Write a scene as one safetensors file, atomically."""
-    names = {kind: name for name, kind in LEVEL_KINDS.items()}
     header = {
         "schema": SCENE_SCHEMA,
-        "levels": [names[type(level)] for level in scene.levels],
+        "levels": [level.kind for level in scene.levels],
         "frames": scene.frames,
         "near": scene.near,
     }
-    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in scene.tensors().items()}
-    write_whole(path, save_tensors(tensors, metadata={"lerobot_msdyn": json.dumps(header)}))
+    write_tensors(path, scene.tensors(), {_SCENE_HEADER: json.dumps(header)})
 
 
 def load_scene(path: Path) -> DynamicScene:
     """Read a scene that `save_scene` wrote.
 
     Raises:
-        MsdynError: the file is absent, damaged, or of another schema.
+        MsdynError: the file is absent, damaged, of another schema, or holds a motion level that is not registered.
     """
     try:
-        with safe_open(path, framework="pt") as file:
-            header = json.loads((file.metadata() or {}).get("lerobot_msdyn", "{}"))
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        tensors, metadata = read_tensors(path)
+        header = json.loads(metadata.get(_SCENE_HEADER, "{}"))
     except (OSError, ValueError, SafetensorError) as error:
         raise MsdynError(f"{path}: not a readable scene file ({error})") from error
     if header.get("schema") != SCENE_SCHEMA:
         raise MsdynError(f"{path}: scene schema is {header.get('schema')}; expected {SCENE_SCHEMA}; fit it again")
-    kinds = header.get("levels", [])
+    kinds = [_level_class(path, kind) for kind in header.get("levels", [])]
 
-    def part(name: str, kind: type) -> dict[str, Tensor]:
-        return {item.name: tensors[f"{name}.{item.name}"] for item in fields(kind)}
+    def part[T](name: str, kind: type[T]) -> T:
+        return from_named_tensors(kind, tensors, name)
 
     try:
         return DynamicScene(
-            static=Gaussians(**part("static", Gaussians)),
-            moving=Gaussians(**part("moving", Gaussians)),
-            levels=tuple(LEVEL_KINDS[kind](**part(f"levels.{i}", LEVEL_KINDS[kind])) for i, kind in enumerate(kinds)),
+            static=part("static", Gaussians),
+            moving=part("moving", Gaussians),
+            levels=tuple(part(f"levels.{i}", kind) for i, kind in enumerate(kinds)),
             indices=tuple(tensors[f"levels.{i}.indices"] for i in range(len(kinds))),
             logits=tuple(tensors[f"levels.{i}.logits"] for i in range(len(kinds))),
             frames=header["frames"],
-            shading=Shading(**part("shading", Shading)) if "shading.field" in tensors else None,
+            shading=part("shading", Shading) if "shading.field" in tensors else None,
             near=header["near"],
-            overlay=Overlay(**part("overlay", Overlay)) if "overlay.first" in tensors else None,
+            overlay=part("overlay", Overlay) if "overlay.first" in tensors else None,
         )
     except KeyError as error:
         raise MsdynError(f"{path}: not a readable scene file ({error} is missing)") from error
+
+
+def _level_class(path: Path, kind: str) -> type:
+    """The class of a kind of motion level, which is that of the level that registers it."""
+    if kind == MotionLevel.kind:
+        return MotionLevel
+    try:
+        return level_spec(kind).value
+    except ConfigError as error:
+        raise MsdynError(
+            f"{path}: its motion is of kind {kind!r}, which is not registered; "
+            f"add --plugins {RIVAL_LEVELS.get(kind, 'FILE.py')}, or import the module that registers it"
+        ) from error

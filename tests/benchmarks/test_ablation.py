@@ -79,11 +79,11 @@ def test_cracks_are_closed_and_holes_are_not(rivals: ModuleType) -> None:
 
 def test_motion_that_is_learned_changes_in_the_fit_and_is_fixed_afterwards(ablation: ModuleType) -> None:
     settings = ablation.Settings(steps=4, width=64, frames=12, every=6)
-    known = ablation.prepared(ablation.synthetic_case("push", 0, 12, 64, 6, true_priors=True))
+    prepared = ablation.prepare(ablation.synthetic_case("push", 0, 12, 64, 6, true_priors=True))
     for name, tensor in (("L1-L3, learned", "displacements"), ("field, learned afresh", "last")):
         row = next(row for row in ablation.ROWS if row.name == name)
         scenes = [
-            ablation.reconstructed(known, one, ablation.recipe_of(one, settings, 0)).windows[0].scene
+            ablation.reconstructed(prepared, one, ablation.recipe_of(one, settings, 0)).windows[0].scene
             for one in (replace(row, learned=""), row)
         ]
         fixed, learned = (getattr(scene.levels[0], tensor) for scene in scenes)
@@ -91,9 +91,9 @@ def test_motion_that_is_learned_changes_in_the_fit_and_is_fixed_afterwards(ablat
         assert not torch.equal(fixed, learned)
 
 
-def test_true_priors_are_those_of_the_made_up_scene(ablation: ModuleType) -> None:
+def test_true_priors_are_those_of_the_synthetic_scene(ablation: ModuleType) -> None:
     own, true = (
-        ablation.prepared(ablation.synthetic_case("push", 0, 12, 64, 6, true_priors=given)) for given in (False, True)
+        ablation.prepare(ablation.synthetic_case("push", 0, 12, 64, 6, true_priors=given)) for given in (False, True)
     )
     assert own.case.truth is None
     assert true.priors.instances is true.case.truth.instances
@@ -147,7 +147,7 @@ def figures() -> list[dict]:
 
 
 def test_the_table_gives_medians_and_their_spread(report: ModuleType) -> None:
-    lines = report.drawn_table(figures(), ["real <arm>"]).splitlines()
+    lines = report.overview_table(figures(), ["real <arm>"]).splitlines()
     assert lines[2] == (
         "| L1 | 21.00 (20.00 to 22.00) | 19.00 (18.00 to 20.00) | 20.00 (20.00 to 20.00) | 20.00 | 20.00 | 20.00 |"
     )
@@ -156,11 +156,11 @@ def test_the_table_gives_medians_and_their_spread(report: ModuleType) -> None:
 
 
 def test_a_row_that_is_not_finished_stays_empty(report: ModuleType) -> None:
-    table = report.drawn_table(figures()[:-1], ["real <arm>"])
+    table = report.overview_table(figures()[:-1], ["real <arm>"])
     assert table.splitlines()[3].endswith("|  |  |  |")
 
 
 def test_the_plot_has_a_dot_for_every_case(report: ModuleType) -> None:
-    drawn = ElementTree.fromstring(report.plot(figures(), ["real <arm>"]))
-    circles = drawn.findall("{http://www.w3.org/2000/svg}circle")
+    picture = ElementTree.fromstring(report.plot(figures(), ["real <arm>"]))
+    circles = picture.findall("{http://www.w3.org/2000/svg}circle")
     assert len(circles) == 8 + 2  # and two of the key

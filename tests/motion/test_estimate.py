@@ -90,17 +90,6 @@ def test_points_seen_in_any_frame_find_their_way_back(deformable, by_levels) -> 
         assert (points - canonical).norm(dim=-1).mean() < 3e-3
 
 
-@pytest.mark.parametrize("model", ["flat", "field"])
-def test_the_models_of_other_systems_explain_it_too(model: str) -> None:
-    body = tracked_body("deformable", tracks=600)
-    motion = fitted(body, model)
-    assert motion.names == (model,)
-    assert error_mm(motion, body) < 4
-    if model == "flat":
-        indices, _ = motion.bind(motion.points, motion.part)
-        assert indices[0].shape == (600, 10)
-
-
 def test_objects_in_contact_keep_to_their_own(tumbling, late) -> None:
     """Two bodies that touch at first: the mask tells them apart, not the distance."""
     beside = tumbling.xyz[:, 0].mean(0) - late.xyz[:, 0].mean(0) + torch.tensor([0.04, 0.0, 0.0])

@@ -1,14 +1,14 @@
 """Frames that are rendered for training are those of the renderer."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
 import torch
 
 from lerobot_msdyn.core.geometry import axis_angle_to_matrix, se3
-from lerobot_msdyn.motion.field import fit_field
 from lerobot_msdyn.motion.model.bases import level_from_motions
 from lerobot_msdyn.scene import store as saved
 from lerobot_msdyn.scene.dynamic import DynamicScene
@@ -46,17 +46,29 @@ def turning(scene: DynamicScene, bases: int = 3) -> DynamicScene:
     )
 
 
-def with_field(scene: DynamicScene) -> DynamicScene:
-    """The scene with a deformation field instead of bases."""
-    means, count = scene.moving.means, len(scene.moving)
-    if count == 0:
-        return scene
-    tracks = means[:20, None] + 0.1 * torch.arange(scene.frames)[None, :, None]
-    field = fit_field(means[:20], tracks, torch.ones(20, scene.frames), steps=5)
-    return replace(scene, levels=(field,), indices=(torch.zeros(count, 1).long(),), logits=(torch.zeros(count, 1),))
+@dataclass(frozen=True)
+class Drift:
+    """Motion of a kind of its own, without bases."""
+
+    kind: ClassVar[str] = "drift"
+
+    per_frame: torch.Tensor  # m
+
+    def carry(self, positions, orientations, indices, logits, times) -> tuple:
+        return self.carry_points(positions, indices, logits, times), orientations
+
+    def carry_points(self, positions, indices, logits, times) -> torch.Tensor:
+        return positions + times[:, None, None] * self.per_frame
 
 
-@pytest.mark.parametrize("change", [lambda scene: scene, turning, with_field], ids=["fitted", "turning", "field"])
+def drifting(scene: DynamicScene) -> DynamicScene:
+    """The scene with a motion that no bases describe."""
+    count = len(scene.moving)
+    level = Drift(torch.tensor([0.1, 0.0, 0.0]))
+    return replace(scene, levels=(level,), indices=(torch.zeros(count, 1).long(),), logits=(torch.zeros(count, 1),))
+
+
+@pytest.mark.parametrize("change", [lambda scene: scene, turning, drifting], ids=["fitted", "turning", "drifting"])
 def test_the_same_picture_as_that_of_the_renderer(scene: SavedScene, change: object) -> None:
     scene = replace(scene, windows=tuple(change(window) for window in scene.windows))
     frames = torch.tensor([2, 8, 9])

@@ -1,4 +1,4 @@
-"""Primitives, grains, particles: levels built on what the coarser ones leave, kept where they prove themselves."""
+"""Finer levels: built on what the coarser ones leave, kept where they prove themselves."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lerobot_msdyn.core.config import LevelName, MotionConfig
+from lerobot_msdyn.core.config import MotionConfig
 from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.motion.finer.residual import (
     ResidualTracks,
@@ -16,24 +16,13 @@ from lerobot_msdyn.motion.finer.residual import (
     smoothed_level,
     solve_residual,
 )
-from lerobot_msdyn.motion.from_tracks.clusters import (
-    direction_features,
-    displacement_features,
-    filled,
-    k_means,
-    spread_nodes,
-)
 from lerobot_msdyn.motion.from_tracks.lift import LiftedTracks
 from lerobot_msdyn.motion.model.bases import MotionLevel, with_idle
-from lerobot_msdyn.motion.model.binding import bind
 from lerobot_msdyn.motion.model.compose import compose_points
-from lerobot_msdyn.motion.model.scene_motion import SceneMotion
+from lerobot_msdyn.motion.model.scene_motion import SceneMotion, bind
+from lerobot_msdyn.motion.spec import FinerLevel, finer_level, frames_per_knot
 
 _SMOOTHINGS = (1.0, 10.0, 100.0, 1000.0)  # of the bases over time, from which held-out tracks choose
-_LEAST_PRIMITIVE = 30  # tracks of a primitive, or ...
-_LEAST_PRIMITIVE_SHARE = 0.01  # ... this share of its part's, if that is more
-_LEAST_OF_FEW = 6  # tracks of a primitive where a part has few
-_LEAST_GRAIN = 12  # tracks of a grain
 _FOLDS = 3  # each third of the tracks judges a level that was fitted to the others
 _LEAST_JUDGES = 8  # tracks, without which a level is refused
 _CANONICAL_REACH = 4  # frames about the canonical one that do not judge
@@ -48,7 +37,7 @@ Approve = Callable[[MotionLevel], Bool[Tensor, " p"]]  # parts in which a level 
 
 
 def add_level(
-    name: LevelName,
+    name: str,
     tracks: ResidualTracks,
     seen: LiftedTracks,
     so_far: SceneMotion,
@@ -63,20 +52,20 @@ def add_level(
     a visible motion of theirs, and surely so (`_proven`), and `approve` agrees; elsewhere its bases are inactive.
     """
     names, levels, canonical = (*so_far.names, name), so_far.levels, so_far.canonical_frame
-    owner, parents = _cluster(name, tracks, config, noise)
+    spec, every = finer_level(name), frames_per_knot(name, config)
+    owner, parents = _clusters(spec, tracks, config, noise)
     places = cluster_places(tracks.points, owner, parents, tracks.positions.shape[1])
-    if name == "grain":
+    if spec.idle:
         places = with_idle(places)
     fold = torch.arange(len(tracks.points)) % _FOLDS
     indices, logits = (each[-1] for each in bind(names, (*levels, places), tracks.points, tracks.part))
 
     def solved(rows: Bool[Tensor, " n"]) -> Float[Tensor, "k t 4 4"]:
         return solve_residual(
-            places, tracks.select(rows), owner[rows], indices[rows], logits[rows], noise=noise, turn=name != "particle"
+            places, tracks.select(rows), owner[rows], indices[rows], logits[rows], noise=noise, turn=spec.turns
         )
 
     def level(motions: Float[Tensor, "k t 4 4"], smoothing: Float[Tensor, " k"]) -> MotionLevel:
-        every = getattr(config.frames_per_knot, name)
         return smoothed_level(places, motions, canonical=canonical, smoothing=smoothing, frames_per_knot=every)
 
     trials = [solved(fold != k) for k in range(_FOLDS)]
@@ -99,37 +88,24 @@ def add_level(
             proven &= approve(found)[: len(proven)]
         kept[owner[proven[tracks.part]]] = True
         coarser = so_far.levels[-1]
-        if name == "grain" and isinstance(coarser, MotionLevel):  # where its primitive was refused, it refines nothing
+        if spec.refines and isinstance(coarser, MotionLevel):
             kept &= coarser.active[found.parents.clamp(min=0)]
         found = replace(found, active=found.active & kept)
     return found, replace(tracks, positions=pull_back(found, indices, logits, tracks.positions), owner=owner)
 
 
-def _cluster(
-    name: LevelName, tracks: ResidualTracks, config: MotionConfig, noise: float
+def _clusters(
+    spec: FinerLevel, tracks: ResidualTracks, config: MotionConfig, noise: float
 ) -> tuple[Int[Tensor, " n"], Int[Tensor, " k"]]:
     """The basis of every track, and the basis of the coarser level that carries each."""
-    group = tracks.part if name == "particle" else tracks.owner
+    group = tracks.part if spec.of_parts else tracks.owner
     owner = torch.zeros_like(group)
     parents: list[int] = []
     for parent in group.unique().tolist():
         rows = (group == parent).nonzero()[:, 0]
-        owner[rows] = _clusters(name, tracks.select(rows), config, noise) + len(parents)
+        owner[rows] = spec.cluster(tracks.select(rows), config, noise) + len(parents)
         parents += [parent] * (int(owner[rows].max()) + 1 - len(parents))
     return owner, torch.tensor(parents)
-
-
-def _clusters(name: LevelName, tracks: ResidualTracks, config: MotionConfig, noise: float) -> Int[Tensor, " n"]:
-    """Tracks of one basis of the coarser level, sorted into those of the next one."""
-    series = filled(tracks.positions, tracks.weights > 0)
-    count = len(tracks.points)
-    if name == "primitive":
-        enough = max(_LEAST_PRIMITIVE, _LEAST_PRIMITIVE_SHARE * count)
-        least = int(max(_LEAST_OF_FEW, min(count / (2 * config.primitives), enough)))
-        return k_means(direction_features(tracks.points, series, noise), config.primitives, least)
-    if name == "grain":
-        return k_means(displacement_features(tracks.points, series), config.grains, _LEAST_GRAIN)
-    return spread_nodes(tracks.points, config.particles)
 
 
 def _gain(
@@ -164,7 +140,7 @@ def _best_smoothing(
 
 def _prediction(
     level: MotionLevel,
-    name: LevelName,
+    name: str,
     judges: Bool[Tensor, " n"],
     tracks: ResidualTracks,
     seen: LiftedTracks,

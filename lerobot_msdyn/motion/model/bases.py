@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -25,6 +26,8 @@ class MotionLevel:
     Displacements are those of the pivot, so rotations and displacements are decoupled and both small; at the
     canonical frame every basis is the identity. Between its knots a motion is interpolated linearly, beyond them held.
     """
+
+    kind: ClassVar[str] = "bases"
 
     rotations_6d: Float[Tensor, "k s 6"]  # first two columns of R, at the knots
     displacements: Float[Tensor, "k s 3"]  # m, at the knots

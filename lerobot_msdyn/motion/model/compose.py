@@ -1,12 +1,35 @@
 """Where the Gaussians are at a time: the finest motion first, then the coarser ones that carry it (docs/method.md)."""
 
+from typing import ClassVar, Protocol, runtime_checkable
+
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lerobot_msdyn.motion.field import DeformationField
-from lerobot_msdyn.motion.model.bases import MotionLevel
 
-Level = MotionLevel | DeformationField
+@runtime_checkable
+class Level(Protocol):
+    """An estimated level of motion: a frozen dataclass of tensors that carries points."""
+
+    kind: ClassVar[str]  # names the class in files of scenes: the level that registers it, "bases" for `MotionLevel`
+
+    def carry(
+        self,
+        positions: Float[Tensor, "b n 3"],
+        orientations: Float[Tensor, "b n 4"],
+        indices: Int[Tensor, "n j"],
+        logits: Float[Tensor, "n j"],
+        times: Float[Tensor, " b"] | Int[Tensor, " b"],
+    ) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b n 4"]]:
+        """Positions (m) and orientations (wxyz) moved by the bases that each point names, at the times of the batch."""
+
+    def carry_points(
+        self,
+        positions: Float[Tensor, "b n 3"],
+        indices: Int[Tensor, "n j"],
+        logits: Float[Tensor, "n j"],
+        times: Float[Tensor, " b"] | Int[Tensor, " b"],
+    ) -> Float[Tensor, "b n 3"]:
+        """Positions (m) as `carry` moves them, without orientations."""
 
 
 def compose(

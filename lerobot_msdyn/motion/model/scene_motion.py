@@ -6,26 +6,33 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lerobot_msdyn.core.config import LevelName
 from lerobot_msdyn.core.geometry import quaternion_to_matrix
-from lerobot_msdyn.motion.model.binding import Bindings, bind
 from lerobot_msdyn.motion.model.compose import Level, compose, compose_points
+from lerobot_msdyn.motion.spec import Binding, first_level, level_spec
 
 _VOTERS = 5  # tracks that decide the part of a point
 _CHUNK = 4096  # points whose distances to all tracks are held at a time
 _INVERSIONS = 4  # steps in which a point is traced back to the canonical frame
 
 
+Bindings = tuple[tuple[Int[Tensor, "n _"], ...], tuple[Float[Tensor, "n _"], ...]]  # indices and logits per level
+
+
 @dataclass(frozen=True)
 class SceneMotion:
     """The levels of motion, and the tracks by which points find what they follow."""
 
-    names: tuple[LevelName, ...]  # coarse to fine
+    names: tuple[str, ...]  # coarse to fine
     levels: tuple[Level, ...]
     canonical_frame: int
     points: Float[Tensor, "n 3"]  # m, tracked points at the canonical frame
     part: Int[Tensor, " n"]  # basis of the first level that each follows
     instance: Int[Tensor, " n"]
+
+    @property
+    def is_rigid(self) -> bool:
+        """Whether every point follows one rigid motion alone."""
+        return len(self.levels) == 1 and first_level(self.names[0]).rigid
 
     def bind(self, points: Float[Tensor, "m 3"], part: Int[Tensor, " m"]) -> Bindings:
         """Indices and logits, per level, of canonical points (m) of known parts."""
@@ -66,7 +73,7 @@ class SceneMotion:
                 part[some], nearest[some] = self._vote(points[some], tracked[tracks], tracks)
         back = quaternion_to_matrix(turned).transpose(1, 2)[nearest]
         x = self.points[nearest] + (back @ (points - tracked[nearest])[..., None])[..., 0]
-        for _ in range(_INVERSIONS if len(self.levels) > 1 or self.names[0] != "object" else 0):
+        for _ in range(0 if self.is_rigid else _INVERSIONS):
             y, turn = (each[0] for each in self.moved(x, part, at))
             x = x + (quaternion_to_matrix(turn).transpose(1, 2) @ (points - y)[..., None])[..., 0]
         return x, part
@@ -80,6 +87,16 @@ class SceneMotion:
         part = votes.scatter_add_(1, self.part[tracks][near], 1 / distance.clamp(min=1e-6)).argmax(dim=1)
         first = (self.part[tracks][near] == part[:, None]).int().argmax(dim=1, keepdim=True)
         return part, tracks[near.gather(1, first)[:, 0]]
+
+
+def bind(
+    names: tuple[str, ...], levels: tuple[Level, ...], points: Float[Tensor, "n 3"], part: Int[Tensor, " n"]
+) -> Bindings:
+    """Indices and logits, per level, of canonical points (m) of known parts."""
+    bindings: list[Binding] = []
+    for name, level in zip(names, levels, strict=True):
+        bindings.append(level_spec(name).bind(level, points, part, bindings[-1] if bindings else None))
+    return tuple(index for index, _ in bindings), tuple(logit for _, logit in bindings)
 
 
 def unturned(count: int) -> Float[Tensor, "n 4"]:

@@ -9,11 +9,12 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.core.config import LevelName, MotionConfig
+from lerobot_msdyn.core.config import MotionConfig
 from lerobot_msdyn.core.geometry import invert_se3, quaternion_to_matrix, se3, transform_points
 from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.motion.model.bases import MotionLevel, level_affines, level_from_motions
 from lerobot_msdyn.motion.model.scene_motion import SceneMotion
+from lerobot_msdyn.motion.spec import frames_per_knot
 from lerobot_msdyn.motion.to_video.alignment import Sightings, Video, centres, costs_in_camera, read_video, sight
 from lerobot_msdyn.motion.to_video.regroup import Grouping, regroup
 
@@ -57,10 +58,10 @@ class Recording:
         if len(self.points) == 0:
             return motion
         found = regroup(self.video, self.points, self._start(motion), config.max_parts)
-        new = _with_parts(motion, found, self.points, config.frames_per_knot.object)
+        new = _with_parts(motion, found, self.points, frames_per_knot(motion.names[0], config))
         return new if self.costs(new)[0].mean() < self.costs(motion)[0].mean() else motion
 
-    def approval(self, motion: SceneMotion, name: LevelName) -> Callable[[MotionLevel], Bool[Tensor, " k"]]:
+    def approval(self, motion: SceneMotion, name: str) -> Callable[[MotionLevel], Bool[Tensor, " k"]]:
         """Says in which parts another level, of this name, makes the judges agree better with the clip."""
 
         def approve(level: MotionLevel) -> Bool[Tensor, " k"]:
@@ -109,13 +110,13 @@ def _traced(motion: SceneMotion, seen: Sightings) -> tuple[Float[Tensor, "n 3"],
     return points, part
 
 
-def _with_parts(motion: SceneMotion, found: Grouping, seen: Sightings, frames_per_knot: int) -> SceneMotion:
+def _with_parts(motion: SceneMotion, found: Grouping, seen: Sightings, knot_step: int) -> SceneMotion:
     """The motion by other parts, which are the identity at the canonical frame."""
     at_canonical = found.motions[:, motion.canonical_frame]
     motions = found.motions @ invert_se3(at_canonical)[:, None]
     points = seen.at_canonical(motions, found.part)[0].float()
     pivots = centres(points, found.part, len(motions))[0]
     level = level_from_motions(
-        motions.float(), pivots, active=found.active, frames_per_knot=frames_per_knot, canonical=motion.canonical_frame
+        motions.float(), pivots, active=found.active, frames_per_knot=knot_step, canonical=motion.canonical_frame
     )
     return replace(motion, levels=(level,), points=points, part=found.part, instance=seen.instance)

@@ -1,13 +1,19 @@
-"""A deformation field: a small network that says how a canonical point has moved (Deformable 3D Gaussians' model)."""
+"""A deformation field: a small network that says how a canonical point has moved (Deformable 3D Gaussians' model).
+
+A motion level of its own: `--plugins benchmarks/rivals/field.py --motion.levels '[field]'`.
+"""
 
 import math
 from dataclasses import dataclass, fields, replace
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from lerobot_msdyn.core.config import MOTION_LEVELS, MotionConfig
 from lerobot_msdyn.core.geometry import quaternion_multiply
+from lerobot_msdyn.motion.spec import Binding, FirstLevel, PartTracks
 
 _POINT_OCTAVES = 6  # frequencies that encode a position ...
 _TIME_OCTAVES = 6  # ... and a time (Deformable 3D Gaussians, section 3.2)
@@ -22,6 +28,8 @@ _HUBER = 0.02  # of the extent: larger misses count linearly
 @dataclass(frozen=True)
 class DeformationField:
     """(x, t) -> displacement and turn, for all points alike: nothing ties a point to an object."""
+
+    kind: ClassVar[str] = "field"
 
     first: Float[Tensor, "f h"]
     hidden: Float[Tensor, "l h h"]
@@ -66,6 +74,23 @@ class DeformationField:
         return x @ self.last
 
 
+@MOTION_LEVELS.register("field")
+class Field(FirstLevel):
+    """One network for the whole scene."""
+
+    value = DeformationField
+
+    def estimate(self, tracks: PartTracks, config: MotionConfig) -> DeformationField:
+        """Fitted to the tracks."""
+        return fit_field(tracks.points, tracks.xyz, tracks.weights)
+
+    def bind(
+        self, level: DeformationField, points: Float[Tensor, "n 3"], part: Int[Tensor, " n"], coarser: Binding | None
+    ) -> Binding:
+        """There are no bases to follow."""
+        return torch.zeros(len(points), 0, dtype=torch.long), torch.zeros(len(points), 0)
+
+
 def fit_field(
     points: Float[Tensor, "n 3"],
     xyz: Float[Tensor, "n t 3"],
@@ -83,8 +108,8 @@ def fit_field(
     decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, _FINAL_RATE ** (1 / max(steps, 1)))
     track, time = (weights > 0).nonzero(as_tuple=True)
     for _ in range(steps if len(track) else 0):
-        some = torch.randint(len(track), (min(_BATCH, len(track)),), generator=generator)
-        n, t = track[some], time[some]
+        batch = torch.randint(len(track), (min(_BATCH, len(track)),), generator=generator)
+        n, t = track[batch], time[batch]
         moved = points[n] + field.extent * field(points[n], t.to(points))[..., :3]
         miss = torch.nn.functional.huber_loss(
             moved / field.extent, xyz[n, t] / field.extent, reduction="none", delta=_HUBER
