@@ -58,8 +58,10 @@ class Account:
         """The account that an `entry` was made of, up to rounding."""
         shares = (entry["by_motion"], entry["by_overlay"], entry["by_background"])
         pixels = MovingPixels(*(round(entry["pixels"] * share) for share in shares))
-        decibels_of = (entry["dynamic_db"], entry["dynamic_without_overlay_db"])
-        return Account(pixels, *(0.0 if db is None else 10 ** (-db / 10) for db in decibels_of), entry["held_out"])
+        shown, alone = (
+            0.0 if db is None else 10 ** (-db / 10) for db in (entry["dynamic_db"], entry["dynamic_without_overlay_db"])
+        )
+        return Account(pixels, shown, alone, entry["held_out"])
 
 
 def pooled(accounts: Sequence[Account]) -> Account:

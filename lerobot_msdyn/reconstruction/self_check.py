@@ -12,7 +12,7 @@ import cv2
 import kornia
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
@@ -24,7 +24,7 @@ from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.reconstruction.account import Account, account_line
 from lerobot_msdyn.scene.draw import draw
 from lerobot_msdyn.scene.gaussians import DynamicScene
-from lerobot_msdyn.scene.sources import sources_of
+from lerobot_msdyn.scene.sources import Sources, sources_of
 
 logger = logging.getLogger(__name__)
 
@@ -78,9 +78,10 @@ def self_check(scene: DynamicScene, view: View, priors: Priors, held_out: Int[Te
     moving = priors.instances[frames] > 0
     wrong = (pictures - recorded).square().mean(-1)
     shown = (drawn.rgb.clamp(0, 1) - recorded).square().mean(-1)
-    pixels = sources_of(scene, camera, frames).count(moving)
-    account = Account(pixels, _mean_over(shown, moving), _mean_over(wrong, moving), len(held_out) > 0)
+    sources = sources_of(scene, camera, frames)
+    account = Account(sources.count(moving), _mean_over(shown, moving), _mean_over(wrong, moving), len(held_out) > 0)
     logger.info("%s", account_line(account))
+    _log_instances(sources, priors.instances[frames])
     following = (frames + 1).clamp(max=total - 1)
     still = stands_still(moving) & stands_still(priors.instances[following] > 0)
     return SelfCheck(
@@ -99,6 +100,15 @@ def self_check(scene: DynamicScene, view: View, priors: Priors, held_out: Int[Te
         flicker(recorded, view.rgb[following].float() / 255, still),
         max(priors.depth_traits.relative_error, unsteadiness(priors) if view.camera.is_static else 0.0),
     )
+
+
+def _log_instances(sources: Sources, instances: UInt8[Tensor, "t h w"]) -> None:
+    """Who renders each instance: a large one that seldom moves would hide a small one that always does."""
+    ids = [number for number in instances.unique().tolist() if number > 0]
+    if len(ids) > 1:
+        shares = {number: sources.count(instances == number).shares["by_motion"] for number in ids}
+        each = ", ".join(f"instance {number} {100 * share:.0f} %" for number, share in shares.items())
+        logger.info("rendered by motion: %s", each)
 
 
 def _mean_over(error: Float[Tensor, "t h w"], moving: Bool[Tensor, "t h w"]) -> float:

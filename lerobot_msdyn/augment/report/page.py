@@ -151,7 +151,7 @@ def _article(entry: ViewEntry) -> str:
     score = f"{scores['expected_db']:.1f} dB expected, {verdict}" if scores else verdict
     why = ""
     if entry.rejected:
-        name = "Why it was dropped" if entry.dropped else "Drawn again, since"
+        name = "Why it was dropped" if entry.dropped else "Sampled again, since"
         why = f'<p class="why">{name}:</p>{bullets(dict.fromkeys(entry.rejected))}'
     return (
         f'<article class="{verdict}"><div class="head"><h3>Episode {entry.episode}, variant {entry.variant}, '
