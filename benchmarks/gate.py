@@ -32,9 +32,9 @@ from corruptions import CORRUPTIONS, clean_priors, corrupted, read_clip
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.config import Recipe
+from lerobot_msdyn.reconstruction.account import decibels
 from lerobot_msdyn.reconstruction.reconstruct import reconstruct
 from lerobot_msdyn.reconstruction.result import Reconstruction
-from lerobot_msdyn.reconstruction.self_check import decibels
 from lerobot_msdyn.views.gate import judge
 from lerobot_msdyn.views.pictures import new_pictures
 

@@ -37,8 +37,8 @@ from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.core.cli import parse_config
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.dataset.read import open_source, read_episode
+from lerobot_msdyn.reconstruction.account import decibels
 from lerobot_msdyn.reconstruction.reconstruct import STEPS, Draft, reconstruct, with_steps
-from lerobot_msdyn.reconstruction.self_check import decibels
 from lerobot_msdyn.render.devices import chosen_device
 from lerobot_msdyn.scene.rendering import render_frames
 from lerobot_msdyn.synthetic import make_scene

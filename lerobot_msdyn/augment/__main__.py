@@ -101,11 +101,13 @@ def augment(
 ) -> int:
     """Run the job that the command line described and say how it went; returns the exit code."""
     from lerobot_msdyn.augment.backgrounds import background_episodes
-    from lerobot_msdyn.augment.report.build import write_report
+    from lerobot_msdyn.augment.report.build import entries_of, write_report
+    from lerobot_msdyn.augment.report.page import accounts_of
     from lerobot_msdyn.augment.run import run_local
     from lerobot_msdyn.augment.run_identity import describe_run, recipe_text, source_files
     from lerobot_msdyn.dataset.provenance import SOURCE_VARIANT
     from lerobot_msdyn.dataset.write import OutputDataset
+    from lerobot_msdyn.reconstruction.account import account_line
     from lerobot_msdyn.views.camera_change import units_of_shifts
 
     start = time.perf_counter()
@@ -126,10 +128,12 @@ def augment(
             return write_report(source, folder, new_root.name, made, skipped, time.perf_counter() - start)
 
         output.finish(new, recipe_text(config), left_out, report)
+    accounts = accounts_of(entries_of(made)[0])
     rendered = sum(episode.provenance.variant != SOURCE_VARIANT for episode in new)
     return _say_skipped(
         f"{len(episodes) - len(failures)} of {len(episodes)} episodes, {rendered} new ones "
         f"({config.variants} per episode, {', '.join(cameras)}), {time.perf_counter() - start:.0f} s\n"
+        f"{''.join(f'{camera}: {account_line(account)}{chr(10)}' for camera, account in accounts.items())}"
         f"{units_of_shifts([episode.provenance.perturbation for episode in made])}"
         f"written to {new_root}\n"
         f"look at {new_root / 'report.html'}\n"

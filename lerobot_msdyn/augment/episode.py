@@ -110,7 +110,9 @@ def _accepted(
     rejected: list[str] = []
     for attempt in range(recipe.gate.redraws + 1):
         found = new_cameras(scenes, recipe, index, variant, attempt, other)
-        views: dict[str, dict[str, Any]] = {key: {"distance_m": scene.distance} for key, scene in scenes.items()}
+        views: dict[str, dict[str, Any]] = {
+            key: {"distance_m": scene.distance, "what_moves": scene.account.entry()} for key, scene in scenes.items()
+        }
         why = [found.rejected] if found.rejected else []
         for key, scene in scenes.items():
             if recipe.gate.enabled:

@@ -5,6 +5,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Bool, UInt8
 from lerobot.datasets import LeRobotDatasetMetadata
 from numpy import ndarray
@@ -17,7 +18,16 @@ from lerobot_msdyn.dataset.select import colour_cameras, select_cameras
 from lerobot_msdyn.evaluate.colour import fit_colours
 from lerobot_msdyn.evaluate.config import HeldoutCameraConfig
 from lerobot_msdyn.evaluate.perceptual import without_flip
-from lerobot_msdyn.evaluate.scores import NEVER, SEEN, Evaluated, Scores, TrueViews, score_table, score_views
+from lerobot_msdyn.evaluate.scores import (
+    NEVER,
+    SEEN,
+    Evaluated,
+    Scores,
+    TrueViews,
+    score_table,
+    score_views,
+    source_shares,
+)
 from lerobot_msdyn.evaluate.timing import timed, timed_reconstruction
 from lerobot_msdyn.evaluate.warp import warped
 from lerobot_msdyn.priors import estimate_masks
@@ -52,7 +62,8 @@ def evaluate_heldout(config: HeldoutCameraConfig) -> Evaluated:
     with timed(seconds, "render"):
         drawn, covered = _drawn(scene, held_out.camera, config.out)
     with timed(seconds, "baselines"):
-        shown = {"this fit": drawn, "recorded picture": _resized(view, held_out)}
+        alone = np.stack([picture.rgb for picture in new_pictures(scene.without_overlay(), held_out.camera)])
+        shown = {"this fit": drawn, "this fit without overlay": alone, "recorded picture": _resized(view, held_out)}
         if scene.metric:
             shown["depth warp"] = _warped(scene, view, held_out.camera)
     with timed(seconds, "score"):
@@ -60,8 +71,10 @@ def evaluate_heldout(config: HeldoutCameraConfig) -> Evaluated:
         covered &= shows_something(held_out.rgb.numpy())
         truth = TrueViews(held_out.rgb.numpy(), np.where(covered, SEEN, NEVER).astype(np.uint8), moving)
         rows = {name: score_half(pictures, truth) for name, pictures in shown.items()}
+        rows["this fit"] |= source_shares(scene, held_out.camera, torch.arange(len(drawn)), truth)
     notices = [without_flip(), "" if scene.metric else "no depth warp: the depth is not metric, nor is the fit's place"]
     content: dict[str, Any] = {"train_camera": train, "test_camera": test, "depth_from": helpers, "rows": rows}
+    content |= {"what_moves": scene.account.entry()}
     content |= {"depth": scene.provenance["depth"], "covered": float(covered.mean()), "pictures": len(drawn)}
     content |= {"seconds": seconds, "notices": [notice for notice in notices if notice]}
     table = score_table(rows, f"{train} -> {test}, {100 * covered.mean():.0f} % covered")

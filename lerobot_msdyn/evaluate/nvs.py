@@ -1,6 +1,6 @@
-"""Held-out views of one episode in the folder of docs/evaluate.md: fitted, drawn, and scored where the truth is there.
+"""Held-out views of one episode in the folder of docs/evaluate.md: fitted, rendered, and scored where truth is there.
 
-The fit reads nothing of `gt/` but the recorded camera; the truth is read after the views are drawn.
+The fit reads nothing of `gt/` but the recorded camera; the truth is read after the views are rendered.
 """
 
 import json
@@ -12,8 +12,9 @@ import av
 import cv2
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Int, UInt8
 from numpy import ndarray
+from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.errors import DatasetError
@@ -22,14 +23,23 @@ from lerobot_msdyn.dataset.read import open_source, read_episode
 from lerobot_msdyn.dataset.select import select_cameras
 from lerobot_msdyn.evaluate.config import EvaluateConfig
 from lerobot_msdyn.evaluate.perceptual import without_flip
-from lerobot_msdyn.evaluate.scores import Evaluated, Scores, TrueViews, mean_scores, score_table, score_views
+from lerobot_msdyn.evaluate.scores import (
+    Evaluated,
+    Scores,
+    TrueViews,
+    dynamic_psnr_db,
+    mean_scores,
+    score_table,
+    score_views,
+    source_shares,
+)
 from lerobot_msdyn.evaluate.timing import timed, timed_reconstruction
 from lerobot_msdyn.reconstruction.result import Reconstruction
 from lerobot_msdyn.views.pictures import new_pictures
 
 
 def evaluate_nvs(config: EvaluateConfig) -> Evaluated:
-    """Fit the episode and draw its held-out cameras to `out`; scores per camera and their mean, written there too.
+    """Fit the episode and render its held-out cameras to `out`; scores per camera and their mean, written there too.
 
     Raises:
         DatasetError: a file of the folder is absent or not as documented.
@@ -43,12 +53,19 @@ def evaluate_nvs(config: EvaluateConfig) -> Evaluated:
     pictures = 0
     for path in sorted((config.scene_folder / "gt" / "heldout").glob("*.npz")):
         with timed(seconds, "render"):
-            drawn = _draw(scene, path, config.out / path.stem)
-        pictures += len(drawn)
+            camera, frames = _held_out_camera(scene, path)
+            rendered = _render(scene, camera, frames)
+            _write(rendered, frames, config.out / path.stem)
+        pictures += len(rendered)
         with timed(seconds, "score"):
             truth = read_truth(config.scene_folder, path.stem)
             if truth is not None:
-                cameras[path.stem] = score_views(drawn, truth)
+                cameras[path.stem] = score_views(rendered, truth)
+        if truth is not None and truth.moving is not None:
+            with timed(seconds, "render without overlay"):
+                alone = _render(scene.without_overlay(), camera, frames)
+            account = {"dyn_psnr_without_overlay": dynamic_psnr_db(alone, truth)}
+            cameras[path.stem] |= account | source_shares(scene, camera, frames, truth)
     mean = mean_scores([*cameras.values()])
     notices = [without_flip()] if cameras else ["no scores: no true views with covis in gt/heldout"]
     content: dict[str, Any] = {
@@ -56,6 +73,7 @@ def evaluate_nvs(config: EvaluateConfig) -> Evaluated:
         "cameras": cameras,
         "mean": mean,
         "pictures": pictures,
+        "what_moves": scene.account.entry(),
     }
     content |= {"seconds": seconds, "notices": [notice for notice in notices if notice]}
     return Evaluated(content, score_table(cameras | {"mean": mean}) if cameras else "", config.out).written()
@@ -97,16 +115,20 @@ def read_truth(folder: Path, camera: str) -> TrueViews | None:
     return TrueViews(rgb, images["covis"].astype(np.uint8), moving)
 
 
-def _draw(scene: Reconstruction, path: Path, out: Path) -> UInt8[ndarray, "n h w 3"]:
-    """The views of one held-out camera, written to `out` as well."""
-    heldout = _arrays(path, ("frame", "c2w", "K"))
-    frames = torch.as_tensor(heldout["frame"]).long()
+def _held_out_camera(scene: Reconstruction, path: Path) -> tuple[CameraTrack, Int[Tensor, " n"]]:
+    """A held-out camera, at the size of the recorded one, and the frames that its poses belong to."""
+    arrays = _arrays(path, ("frame", "c2w", "K"))
+    return _track(arrays, scene.camera.width, scene.camera.height), torch.as_tensor(arrays["frame"]).long()
+
+
+def _render(scene: Reconstruction, camera: CameraTrack, frames: Int[Tensor, " n"]) -> UInt8[ndarray, "n h w 3"]:
+    return np.stack([picture.rgb for picture in new_pictures(scene, camera, frames)])
+
+
+def _write(pictures: UInt8[ndarray, "n h w 3"], frames: Int[Tensor, " n"], out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
-    camera = _track(heldout, scene.camera.width, scene.camera.height)
-    drawn = [picture.rgb for picture in new_pictures(scene, camera, frames)]
-    for frame, picture in zip(frames.tolist(), drawn, strict=True):
+    for frame, picture in zip(frames.tolist(), pictures, strict=True):
         cv2.imwrite(str(out / f"rgb_{frame:04d}.png"), picture[..., ::-1])
-    return np.stack(drawn)
 
 
 def _track(arrays: dict[str, ndarray], width: int, height: int) -> CameraTrack:

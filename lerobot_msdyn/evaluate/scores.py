@@ -1,4 +1,10 @@
-"""Scores of the drawn views of one camera against the true ones, and of several cameras together."""
+"""Scores of the rendered views of one camera against the true ones, and of several cameras together.
+
+The moving pixels of a camera that was not fitted are those that truly show something that moves (of a calibrated rig:
+those that its masks call moving), as far as the recorded camera has seen them. `dyn_psnr` is over them, of views as
+they are rendered; `dyn_psnr_without_overlay` of views without overlays; `by_*` is the share of them that each source
+renders (`scene.sources`), of all frames together.
+"""
 
 import json
 import math
@@ -8,20 +14,31 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, UInt8
+import torch
+from jaxtyping import Bool, Int, UInt8
 from numpy import ndarray
+from torch import Tensor
 
+from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.files import write_whole
 from lerobot_msdyn.evaluate.metrics import flicker, inside_ssim, masked_psnr_db
 from lerobot_msdyn.evaluate.perceptual import masked_flip, without_flip
+from lerobot_msdyn.reconstruction.account import Account, account_line
+from lerobot_msdyn.reconstruction.result import Reconstruction
+from lerobot_msdyn.scene.sources import MovingPixels, sources_of
 
+BATCH = 8  # pictures that are rendered together
 MIN_PIXELS = 40  # a frame with fewer of a kind is left out of that kind's mean
 NEVER, ELSEWHEN, SEEN = 0, 1, 2  # of a pixel: by the recorded camera never, at another time only, at the same time
 NAMES = {  # score -> its column
     "psnr": "PSNR",
     "ssim": "SSIM",
-    "dyn_psnr": "moving PSNR",
-    "dyn_ssim": "moving SSIM",
+    "dyn_psnr": "dynamic PSNR",
+    "dyn_psnr_without_overlay": "without overlay",
+    "by_motion": "by motion",
+    "by_overlay": "by overlay",
+    "by_background": "by background",
+    "dyn_ssim": "dynamic SSIM",
     "dis_psnr": "disocc. PSNR",
     "flip": "FLIP",
     "flicker": "flicker",
@@ -59,7 +76,9 @@ class Evaluated:
     def text(self) -> str:
         """For the terminal."""
         stages = [f"{stage:28s}{value:8.1f} s" for stage, value in self.content["seconds"].items()]
-        lines = [*stages, *self.table.splitlines(), *self.content["notices"]]
+        account = self.content.get("what_moves")
+        recorded = [] if account is None else [f"recorded camera: {account_line(Account.from_entry(account))}"]
+        lines = [*stages, *self.table.splitlines(), *recorded, *self.content["notices"]]
         return (
             "\n".join([*lines, f"{self.content['pictures']} pictures and {SCORES_FILE} written to {self.out}"]) + "\n"
         )
@@ -88,6 +107,28 @@ def score_views(drawn: UInt8[ndarray, "n h w 3"], true: TrueViews) -> Scores:
     return mean_scores(frames) | {"flicker": flicker(drawn, true.rgb, still)}
 
 
+def dynamic_psnr_db(rendered: UInt8[ndarray, "n h w 3"], true: TrueViews) -> float:
+    """The score `dyn_psnr` alone; NaN where it is not known what moves, or no frame has enough of it."""
+    if true.moving is None:
+        return math.nan
+    masks = (true.seen != NEVER) & true.moving
+    enough = [i for i, mask in enumerate(masks) if mask.sum() >= MIN_PIXELS]
+    return float(np.mean([masked_psnr_db(rendered[i], true.rgb[i], masks[i]) for i in enough])) if enough else math.nan
+
+
+def source_shares(scene: Reconstruction, camera: CameraTrack, frames: Int[Tensor, " n"], true: TrueViews) -> Scores:
+    """The scores `by_*` of views at some frames of the episode, a pose each; none where nothing is known to move."""
+    if true.moving is None:
+        return {}
+    moving = torch.from_numpy((true.seen != NEVER) & true.moving)
+    counted = MovingPixels()
+    for window, stretch in scene.stretches(frames):
+        for part in torch.arange(len(frames))[stretch].split(BATCH):
+            sources = sources_of(window.scene, camera.select(part), frames[part] - window.start)
+            counted += sources.count(moving[part])
+    return counted.shares if counted.total > 0 else {}
+
+
 def mean_scores(scores: list[Scores]) -> Scores:
     """The mean of each score over those that have it, in the order of the columns."""
     found = {name: [one[name] for one in scores if not math.isnan(one.get(name, math.nan))] for name in NAMES}
@@ -106,6 +147,8 @@ def score_table(cameras: Mapping[str, Scores], first: str = "camera") -> str:
 def _shown(name: str, value: float) -> str:
     if math.isnan(value):
         return "-"
+    if name.startswith("by_"):
+        return f"{100 * value:.0f} %"
     return f"{value:.2f}" if "psnr" in name or name == "flicker" else f"{value:.3f}"
 
 

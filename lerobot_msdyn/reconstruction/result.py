@@ -1,13 +1,14 @@
 """One camera's reconstruction: what new views of an episode are rendered from and judged by."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Int
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.reconstruction.account import Account, pooled
 from lerobot_msdyn.reconstruction.evidence import Evidence
 from lerobot_msdyn.reconstruction.self_check import SelfCheck
 from lerobot_msdyn.scene.dynamic import DynamicScene
@@ -45,6 +46,16 @@ class Reconstruction:
             for step, seconds in window.seconds.items():
                 total[step] = total.get(step, 0.0) + seconds
         return total
+
+    @property
+    def account(self) -> Account:
+        """What renders the moving pixels of the recorded camera, and how well, over all windows."""
+        return pooled([window.self_check.account for window in self.windows])
+
+    def without_overlay(self) -> "Reconstruction":
+        """The same rendered by motion and background alone."""
+        windows = (replace(window, scene=replace(window.scene, overlay=None)) for window in self.windows)
+        return replace(self, windows=tuple(windows))
 
     def stretches(self, frames: Int[Tensor, " t"]) -> Iterator[tuple[FittedWindow, slice]]:
         """Stretches of frames that are of the same window, in order, with the window."""

@@ -5,13 +5,14 @@ were not fitted to them. New views are drawn with the overlay, which every frame
 them is judged with it, and what the scene alone makes of frames that it never saw is said beside.
 """
 
+import logging
 from dataclasses import dataclass, replace
 
 import cv2
 import kornia
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
@@ -20,8 +21,12 @@ from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.priors import Priors
+from lerobot_msdyn.reconstruction.account import Account, account_line
 from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.rendering import render_scene
+from lerobot_msdyn.scene.sources import Sources, sources_of
+
+logger = logging.getLogger(__name__)
 
 CHECKED_FRAMES = 3  # frames that are looked at where none was held out
 STILL_PX = 5  # side of the square around a pixel in which nothing may move for it to stand still
@@ -43,16 +48,17 @@ class SelfCheck:
     drawn_depth: Float[Tensor, "t h w"]  # m, of the scene with its overlay
     error: Float[Tensor, " t"]  # mean square colour error of the scene with its overlay, 0..1
     fitted_error: Float[Tensor, " t"]  # the same without the overlay
-    moving_error: float  # the same over what moves; 0 where nothing does
+    moving: Bool[Tensor, "t h w"]  # where the masks say that something moves
+    account: Account  # what renders these pixels, and how well
     ssim: float  # without the overlay
     track_px: float  # median distance of the tracks to the motion's projection
     flicker: float  # mean absolute difference of what stands still to the next frame, 0..1
     depth_error: float  # relative: what the provider of depth is known for, or more where its depth is less steady
 
-
-def decibels(error: float) -> float:
-    """Peak signal-to-noise ratio (dB) of a mean square error of colours 0..1."""
-    return float(-10 * np.log10(max(error, 1e-6)))
+    @property
+    def moving_error(self) -> float:
+        """Mean square colour error of what moves without the overlay, 0..1; 0 where nothing does."""
+        return self.account.error_without_overlay
 
 
 @torch.no_grad()
@@ -69,9 +75,15 @@ def self_check(scene: DynamicScene, view: View, priors: Priors, held_out: Int[Te
     drawn = to_device(render_scene(scene, camera, frames), "cpu")
     recorded = view.rgb[frames].float() / 255
     pictures = render_scene(replace(scene, overlay=None), camera, frames).rgb.clamp(0, 1).cpu()
-    wrong, moving = (pictures - recorded).square().mean(-1), priors.instances[frames] > 0
+    moving = priors.instances[frames] > 0
+    wrong = (pictures - recorded).square().mean(-1)
+    shown = (drawn.rgb.clamp(0, 1) - recorded).square().mean(-1)
+    sources = sources_of(scene, camera, frames)
+    account = Account(sources.count(moving), _mean_over(shown, moving), _mean_over(wrong, moving), len(held_out) > 0)
+    logger.info("%s", account_line(account))
+    _log_instances(sources, priors.instances[frames])
     following = (frames + 1).clamp(max=total - 1)
-    still = stands_still(priors.instances[frames] > 0) & stands_still(priors.instances[following] > 0)
+    still = stands_still(moving) & stands_still(priors.instances[following] > 0)
     return SelfCheck(
         frames,
         len(held_out) > 0,
@@ -79,14 +91,28 @@ def self_check(scene: DynamicScene, view: View, priors: Priors, held_out: Int[Te
         recorded,
         priors.depth[frames],
         drawn.depth,
-        (drawn.rgb.clamp(0, 1) - recorded).square().mean((1, 2, 3)),
+        shown.mean((1, 2)),
         wrong.mean((1, 2)),
-        float(wrong[moving].mean()) if bool(moving.any()) else 0.0,
+        moving,
+        account,
         similarity(pictures, recorded),
         _track_residual(scene, view.camera, priors),
         flicker(recorded, view.rgb[following].float() / 255, still),
         max(priors.depth_traits.relative_error, unsteadiness(priors) if view.camera.is_static else 0.0),
     )
+
+
+def _log_instances(sources: Sources, instances: UInt8[Tensor, "t h w"]) -> None:
+    """Who renders each instance: a large one that seldom moves would hide a small one that always does."""
+    ids = [number for number in instances.unique().tolist() if number > 0]
+    if len(ids) > 1:
+        shares = {number: sources.count(instances == number).shares["by_motion"] for number in ids}
+        each = ", ".join(f"instance {number} {100 * share:.0f} %" for number, share in shares.items())
+        logger.info("rendered by motion: %s", each)
+
+
+def _mean_over(error: Float[Tensor, "t h w"], moving: Bool[Tensor, "t h w"]) -> float:
+    return float(error[moving].mean()) if bool(moving.any()) else 0.0
 
 
 def unsteadiness(priors: Priors) -> float:

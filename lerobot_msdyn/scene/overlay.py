@@ -38,7 +38,7 @@ class Overlay:
 
     def patch(self, frame: int, gaussians: int) -> FramePatch:
         """The patch of a frame of a scene with so many Gaussians of its own."""
-        rows = slice(self._first[frame], self._first[frame + 1])
+        rows = self.rows(frame)
         places = torch.arange(7, -1, -1, dtype=torch.uint8, device=self.hidden.device)
         bits = (self.hidden[frame][:, None] >> places) & 1
         return FramePatch(
@@ -48,6 +48,10 @@ class Overlay:
             self.rgb[rows].float(),
             bits.bool().flatten()[:gaussians],
         )
+
+    def rows(self, frame: int) -> slice:
+        """Where the Gaussians of a frame are."""
+        return slice(self._first[frame], self._first[frame + 1])
 
     @cached_property
     def _first(self) -> list[int]:

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.geometry import pixel_grid, project, transform_points, unproject
-from lerobot_msdyn.reconstruction.self_check import SelfCheck, decibels
+from lerobot_msdyn.reconstruction.account import decibels
+from lerobot_msdyn.reconstruction.self_check import SelfCheck
 
 FINEST_PX = 12**-0.5  # along each axis, by which a point is off that lies anywhere within a pixel: (1/12)^(1/2)
 BETWEEN = 0.5  # where two depths disagree, the truth is taken to lie in the middle

@@ -13,9 +13,11 @@ from numpy import ndarray
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.config import GateConfig
 from lerobot_msdyn.core.serialise import to_device
+from lerobot_msdyn.reconstruction.account import decibels, pooled
 from lerobot_msdyn.reconstruction.result import FittedWindow
-from lerobot_msdyn.reconstruction.self_check import decibels, flicker, sharpness, stands_still
+from lerobot_msdyn.reconstruction.self_check import flicker, sharpness, stands_still
 from lerobot_msdyn.scene.rendering import Rendering, render_scene
+from lerobot_msdyn.scene.sources import MovingPixels, moving_pixels_of_view
 from lerobot_msdyn.views.coverage import Coverage, coverage_of
 from lerobot_msdyn.views.expected_error import Expected, expected_error
 
@@ -48,6 +50,9 @@ class Scores:
     held_out_db: float  # of the recorded view, on frames that the fit never saw (if held_out), without overlay
     held_out_ssim: float
     moving_db: float  # the same over what moves: low where motion is not understood, however little of it there is
+    moving_with_overlay_db: float  # the same with overlay, whose pixels are those of the recorded view itself
+    by_motion: float  # share of this view's moving pixels that motion renders, 0..1; see scene/sources.py
+    by_overlay: float  # that an overlay renders; both 0 where nothing moves
     held_out: bool  # whether there were such frames
     unseen: float  # mean over the frames, 0..1
     angle_deg: float
@@ -64,12 +69,14 @@ def judge(windows: Sequence[FittedWindow], camera: CameraTrack) -> Scores:
     frames: list[FrameScores] = []
     expected: list[Expected] = []
     unseen, steady, own = [], 0.0, 0.0
+    moving = MovingPixels()
     for window in windows:
         check = window.self_check
         fitted = check.camera
         poses = camera.select(check.frames + window.start).resized(fitted.width, fitted.height)
         error = expected_error(check, poses)
         drawn, found = _draw(window, poses)
+        moving += moving_pixels_of_view(window.scene, poses, check.frames, fitted, check.moving)
         pictures = drawn.rgb.clamp(0, 1)
         after = (check.frames + 1).clamp(max=window.scene.frames - 1)
         following = to_device(render_scene(window.scene, poses, after), "cpu")
@@ -87,12 +94,16 @@ def judge(windows: Sequence[FittedWindow], camera: CameraTrack) -> Scores:
             )
     total = Expected(**{name: torch.cat([getattr(part, name) for part in expected]) for name in vars(expected[0])})
     checks = [window.self_check for window in windows]
+    account = pooled([check.account for check in checks])
     return Scores(
         total.psnr_db,
         total.shares,
         decibels(float(torch.cat([check.fitted_error for check in checks]).mean())),
         float(np.mean([check.ssim for check in checks])),
-        decibels(float(np.mean([check.moving_error for check in checks]))),
+        decibels(account.error_without_overlay),
+        decibels(account.error),
+        moving.shares["by_motion"],
+        moving.shares["by_overlay"],
         all(check.held_out for check in checks),
         float(np.mean([frame.unseen for frame in frames])),
         float(np.mean([frame.angle_deg for frame in frames])),

@@ -2,18 +2,21 @@
 
 import dataclasses
 import html.parser
+import json
 import re
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from lerobot_msdyn.augment import __main__ as augment
+from lerobot_msdyn.augment import episode as episodes
 from lerobot_msdyn.augment.report import build
 from lerobot_msdyn.augment.report.drawing import cameras_from_above
 from lerobot_msdyn.augment.report.page import LISTED, Pictures, ViewEntry, page
 from lerobot_msdyn.augment.report.pictures import data_url, film, heat_map, spread, strip
-from lerobot_msdyn.reconstruction import reconstruct as pipeline
+from lerobot_msdyn.reconstruction.account import Account, account_sentence
 
 FRONT = "observation.images.front"
 FAST = ("--fit.steps", "4", "--scene.moving_gaussians", "500", "--scene.moving_frames", "4", "--fit.max_width", "48")
@@ -22,6 +25,9 @@ SCORES = {
     "expected_db": 21.5,
     "held_out_db": 27.0,
     "moving_db": 21.0,
+    "moving_with_overlay_db": 29.0,
+    "by_motion": 0.25,
+    "by_overlay": 0.75,
     "held_out_ssim": 0.9,
     "unseen": 0.05,
     "angle_deg": 4.0,
@@ -31,6 +37,15 @@ SCORES = {
     "causes": {"video": 0.6, "geometry": 0.4},
     "frames": [{"frame": 3, "expected_db": 21.5, "unseen": 0.05, "angle_deg": 4.0, "sharpness_ratio": 0.6}],
     "heat": [[0, 50], [100, 0]],
+}
+WHAT_MOVES = {
+    "pixels": 1000,
+    "by_motion": 0.3,
+    "by_overlay": 0.68,
+    "by_background": 0.02,
+    "dynamic_db": 28.4,
+    "dynamic_without_overlay_db": 19.6,
+    "held_out": True,
 }
 VOID = {"meta", "img", "br", "circle", "polygon", "polyline"}
 
@@ -67,7 +82,7 @@ def outline(text: str) -> Outline:
 
 
 def entry(episode: int = 0, **changes: object) -> ViewEntry:
-    view = {"camera_from_source": np.eye(4).tolist(), "distance_m": 0.6, "scores": SCORES}
+    view = {"camera_from_source": np.eye(4).tolist(), "distance_m": 0.6, "what_moves": WHAT_MOVES, "scores": SCORES}
     plain = ViewEntry(episode, 0, FRONT, {"azimuth_deg": 3.0, "shift_x_m": 0.01}, view, [], dropped=False)
     return dataclasses.replace(plain, **changes)
 
@@ -90,14 +105,29 @@ def test_a_dropped_view_says_why_and_a_redrawn_one_too() -> None:
     assert "dropped: too dark" in text
     assert "episode 3: no video" in text
     pictures = Pictures("", "", 1, 1.0, None)
-    assert "Drawn again, since" in page("ds", {}, [entry(rejected=["too dark"], pictures=pictures)], [])
+    assert "Sampled again, since" in page("ds", {}, [entry(rejected=["too dark"], pictures=pictures)], [])
 
 
 def test_views_that_were_not_judged_are_shown_as_such() -> None:
-    view = {"camera_from_source": np.eye(4).tolist(), "distance_m": 0.6}
+    view = {"camera_from_source": np.eye(4).tolist(), "distance_m": 0.6, "what_moves": WHAT_MOVES}
     text = page("ds", {}, [entry(view=view, pictures=Pictures("", "", 1, 1.0, None))], [])
     assert "not judged" in text
     outline(text)
+
+
+def test_it_says_what_renders_what_moves() -> None:
+    """Per camera, every episode once, however many variants it has; and a row per view."""
+    other = WHAT_MOVES | {"by_motion": 0.9, "by_overlay": 0.1, "by_background": 0.0}
+    second = entry(1, view=entry().view | {"what_moves": other})
+    text = page("ds", {}, [entry(0), entry(0), second], [])
+    assert f"{FRONT}: of the pixels that show something moving, 60 % are rendered by motion, 39 % are recorded" in text
+    assert "PSNR is 28.4 dB, and 19.6 dB without the overlay" in text
+    assert text.count("<td>30%</td><td>68%</td><td>28.4 dB</td><td>19.6 dB</td>") == 2
+    nothing = WHAT_MOVES | {"pixels": 0, "by_motion": 0.0, "by_overlay": 0.0, "by_background": 0.0}
+    nothing |= {"dynamic_db": None, "dynamic_without_overlay_db": None}
+    still = page("ds", {}, [entry(0, view=entry().view | {"what_moves": nothing})], [])
+    assert "nothing moves in the frames that were checked" in still
+    outline(still)
 
 
 def test_the_page_is_bounded() -> None:
@@ -150,27 +180,41 @@ def test_a_run_leaves_a_report_that_needs_nothing_else(reported: Path) -> None:
     assert len(text) < 2_000_000
 
 
+def test_report_and_record_agree_on_what_renders_what_moves(reported: Path) -> None:
+    rows = pq.read_table(reported / "meta" / "msdyn" / "episodes.parquet").to_pylist()
+    views = [json.loads(row["gate"])["views"][FRONT] for row in rows if row["variant"] >= 0]
+    assert len(views) == 2
+    for view in views:  # of one reconstruction
+        assert view["what_moves"] == views[0]["what_moves"]
+        assert view["what_moves"]["pixels"] > 0
+        assert 0 <= view["scores"]["by_overlay"] <= 1
+        assert view["scores"]["moving_db"] == pytest.approx(view["what_moves"]["dynamic_without_overlay_db"], abs=0.01)
+    sentence = account_sentence(Account.from_entry(views[0]["what_moves"]))
+    assert f"{FRONT}: {sentence}" in (reported / "report.html").read_text()
+
+
 def test_what_the_gate_rejects_is_drawn_again_and_then_dropped(
     desk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn = []
-    judge = pipeline.judge
+    judge = episodes.judge
 
     def counted(windows: object, camera: object) -> object:
         drawn.append(camera)
         scores = judge(windows, camera)
         return dataclasses.replace(scores, expected_db=1.0) if len(drawn) in (1, 2, 3, 4) else scores
 
-    monkeypatch.setattr(pipeline, "judge", counted)
+    monkeypatch.setattr(episodes, "judge", counted)
     arguments = ["--repo", "local/desk", "--root", str(desk), "--new_root", str(tmp_path / "new"), "--episodes", "[0]"]
     settings = ["--cameras", "[front]", "--variants", "2", "--gate.redraws", "2", *FAST]
     assert augment.run([*arguments, *settings]) == 1
     said = capsys.readouterr().out
     assert "dropped: episode 0 variant 0: " in said
     assert "1 new ones" in said
+    assert f"{FRONT}: what moves: " in said
     assert len(drawn) == 3 + 2
     poses = {tuple(camera.world_from_camera[0].flatten().tolist()) for camera in drawn}
     assert len(poses) == len(drawn)
     text = (tmp_path / "new" / "report.html").read_text()
     assert "Why it was dropped" in text
-    assert "Drawn again, since" in text
+    assert "Sampled again, since" in text

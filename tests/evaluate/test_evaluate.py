@@ -36,6 +36,17 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same with gt/meta.json, which tells what moves, and two held-out cameras."""
+    root = tmp_path_factory.mktemp("whole") / "push"
+    write_nvs_folder(make_scene("push", 0, 16, 96, 72), root)
+    for path in (root / "gt" / "heldout").glob("*.npz"):
+        if path.stem not in ("az+05", "el+08"):
+            path.unlink()
+    return root
+
+
 def psnr(folder: Path, out: Path, camera: str) -> float:
     """Of the drawn views over pixels that the recorded camera saw at some time."""
     truth = np.load(folder / "gt" / "heldout" / f"{camera}.npz")
@@ -53,6 +64,24 @@ def unchanged_psnr(folder: Path, camera: str) -> float:
     recorded = read_colour(source, 0, "observation.images.front", read_rows(source, 0))[0].numpy().astype(float)
     true = read_picture(folder / "gt" / "heldout" / camera / "rgb_0000.png")
     return float(10 * np.log10(255**2 / ((recorded - true) ** 2).mean()))
+
+
+@pytest.mark.slow
+def test_what_moves_is_scored_with_and_without_overlay(whole: Path, tmp_path: Path) -> None:
+    for overlay, out in (("true", tmp_path / "with"), ("false", tmp_path / "without")):
+        assert run("nvs", "--scene", str(whole), "--out", str(out), "--scene.overlay", overlay, *FAST) == 0
+    shown, motion = (json.loads((tmp_path / name / "scores.json").read_text()) for name in ("with", "without"))
+    for camera, scores in shown["cameras"].items():
+        assert scores["by_motion"] + scores["by_overlay"] + scores["by_background"] == pytest.approx(1, abs=1e-4)
+        assert scores["by_overlay"] > 0.3, camera
+        alone = motion["cameras"][camera]
+        assert alone["by_overlay"] == 0
+        # The same scene, once rendered without its overlay, once made without one.
+        assert scores["dyn_psnr_without_overlay"] == pytest.approx(alone["dyn_psnr"], abs=0.05)
+        assert alone["dyn_psnr_without_overlay"] == alone["dyn_psnr"]
+    assert shown["mean"]["dyn_psnr"] > shown["mean"]["dyn_psnr_without_overlay"] + 0.3
+    assert shown["what_moves"]["dynamic_db"] > shown["what_moves"]["dynamic_without_overlay_db"] + 3
+    assert motion["what_moves"]["by_overlay"] == 0
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """Scores of views: which pixels count for what, and the table."""
 
+import dataclasses
 import importlib.util
 import json
 import math
@@ -9,7 +10,9 @@ import numpy as np
 import pytest
 
 from lerobot_msdyn.evaluate.nvs import read_truth
-from lerobot_msdyn.evaluate.scores import Evaluated, TrueViews, mean_scores, score_table, score_views
+from lerobot_msdyn.evaluate.scores import Evaluated, TrueViews, dynamic_psnr_db, mean_scores, score_table, score_views
+from lerobot_msdyn.reconstruction.account import Account, account_line
+from lerobot_msdyn.scene.sources import MovingPixels
 
 SIZE = (2, 40, 50)
 
@@ -40,6 +43,14 @@ def test_each_score_is_over_its_own_pixels() -> None:
     assert 0 < found["dyn_ssim"] < 1
 
 
+def test_dynamic_psnr_alone_is_that_among_the_scores() -> None:
+    rendered, true = views()
+    assert dynamic_psnr_db(rendered, true) == pytest.approx(score_views(rendered, true)["dyn_psnr"])
+    assert math.isnan(dynamic_psnr_db(rendered, dataclasses.replace(true, moving=None)))
+    still = dataclasses.replace(true, moving=np.zeros(SIZE, bool))
+    assert math.isnan(dynamic_psnr_db(rendered, still))
+
+
 def test_what_no_frame_shows_has_no_score() -> None:
     drawn, true = views()
     found = score_views(drawn, TrueViews(true.rgb, np.full(SIZE, 2, np.uint8)))
@@ -51,7 +62,13 @@ def test_what_no_frame_shows_has_no_score() -> None:
 def test_table_and_file(tmp_path: Path) -> None:
     table = score_table({"az+05": {"psnr": 21.234, "ssim": 0.71234}, "mean": {"psnr": 21.234}})
     assert table.splitlines()[2:] == ["| az+05 | 21.23 | 0.712 |", "| mean | 21.23 | - |"]
+    shares = {"by_motion": 0.234, "by_overlay": 0.766, "dyn_psnr": 21.0, "dyn_psnr_without_overlay": 17.0}
+    table_of_sources = score_table({"az+05": shares}).splitlines()
+    assert table_of_sources[0] == "| camera | dynamic PSNR | without overlay | by motion | by overlay |"
+    assert table_of_sources[2] == "| az+05 | 21.00 | 17.00 | 23 % | 77 % |"
+    account = Account(MovingPixels(10, 90), 1e-3, 1e-2, held_out=True)
     content = {
+        "what_moves": account.entry(),
         "mean": {"psnr": math.inf, "ssim": 0.123456789},
         "seconds": {"fit": 1.0},
         "notices": ["no"],
@@ -61,6 +78,7 @@ def test_table_and_file(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "out" / "scores.json").read_text())["mean"] == {"psnr": None, "ssim": 0.12346}
     assert "3 pictures and scores.json written" in text
     assert table.splitlines()[0] in text
+    assert f"recorded camera: {account_line(account)}" in text
 
 
 def test_scores_agree_with_the_scorer_of_the_data(shared_data: Path) -> None:

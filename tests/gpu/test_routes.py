@@ -9,7 +9,7 @@ from lerobot_msdyn.augment import __main__ as augment
 from lerobot_msdyn.core.config import Device, Recipe
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.reconstruction import reconstruct as pipeline
-from lerobot_msdyn.reconstruction.self_check import decibels
+from lerobot_msdyn.reconstruction.account import decibels
 from lerobot_msdyn.render.availability import cuda_problem
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.views.pictures import new_pictures, on_device

@@ -9,11 +9,11 @@ from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.config import GateConfig, Recipe
 from lerobot_msdyn.core.observations import DepthTraits, View
 from lerobot_msdyn.priors import PointTracks, Priors
+from lerobot_msdyn.reconstruction.account import decibels
 from lerobot_msdyn.reconstruction.reconstruct import reconstruct
 from lerobot_msdyn.reconstruction.result import Reconstruction
 from lerobot_msdyn.reconstruction.self_check import (
     SelfCheck,
-    decibels,
     flicker,
     sharpness,
     similarity,
@@ -66,6 +66,26 @@ def test_witnesses_are_frames_that_were_not_fitted(scene: Reconstruction) -> Non
     assert self_check.moving_error > self_check.fitted_error.mean()
     assert self_check.depth_error == pytest.approx(0.01, abs=0.002)
     assert 0 < self_check.track_px < GateConfig().max_track_px
+
+
+def test_what_moves_is_accounted_for(scene: Reconstruction) -> None:
+    check, (window,) = scene.windows[0].self_check, scene.windows
+    account = scene.account
+    assert account == check.account
+    assert account.pixels.total == int(check.moving.sum()) > 100
+    assert account.held_out
+    assert account.error < account.error_without_overlay == check.moving_error
+    assert account.pixels.shares["by_overlay"] > 0.5, "so small a video is hardly explained by motion"
+    alone = scene.without_overlay()
+    assert alone.windows[0].scene.overlay is None
+    assert window.scene.overlay is not None
+    here, there, without = score(scene, 0), score(scene, 8), score(alone, 8)
+    assert here.by_overlay == pytest.approx(account.pixels.shares["by_overlay"], abs=0.1)
+    assert there.by_motion + there.by_overlay == pytest.approx(1, abs=0.01)
+    assert there.by_overlay > 0.5
+    assert (without.by_motion, without.by_overlay) == (1, 0)
+    assert there.moving_db == pytest.approx(account.dynamic_without_overlay_db)
+    assert there.moving_with_overlay_db == pytest.approx(account.dynamic_db)
 
 
 def test_short_videos_have_witnesses_too(pushed: View) -> None:

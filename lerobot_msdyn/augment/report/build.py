@@ -51,7 +51,7 @@ def write_report(
         skipped: why source episodes were left out, one line each.
         seconds: what the run took.
     """
-    entries, places = _entries(episodes)
+    entries, places = entries_of(episodes)
     output = open_source(source.repo_id, root)
     for i in sorted(_pictured(entries)):
         entry = entries[i]
@@ -61,7 +61,7 @@ def write_report(
     return path
 
 
-def _entries(episodes: Sequence[NewEpisode]) -> tuple[list[ViewEntry], dict[int, int]]:
+def entries_of(episodes: Sequence[NewEpisode]) -> tuple[list[ViewEntry], dict[int, int]]:
     """All views, and for those that were kept the episode of the output."""
     entries: list[ViewEntry] = []
     places: dict[int, int] = {}
@@ -119,7 +119,7 @@ def _figures(
         "new episodes": str(sum(not episode.dropped for episode in made)),
         "dropped by the gate": str(sum(bool(episode.dropped) for episode in made)),
         "source episodes skipped": str(len(skipped)),
-        "draws rejected": str(sum(len(episode.provenance.gate["rejected"]) for episode in made)),
+        "samples rejected": str(sum(len(episode.provenance.gate["rejected"]) for episode in made)),
         "expected quality, median": f"{np.median(scores):.1f} dB" if scores else "not judged",
         "all in all": _time(seconds),
         "in fitting": _time(sum(fitting.values())),

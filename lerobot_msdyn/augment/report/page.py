@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from lerobot_msdyn.augment.report.drawing import cameras_from_above
+from lerobot_msdyn.reconstruction.account import Account, account_sentence, pooled
 
 LISTED = 1000  # rows of the table, at most
 DRAWN_POSES = 8  # of a camera that moves along the episode, about
@@ -53,7 +54,10 @@ NAMES = {
     "expected_db": ("expected quality", "{:.1f} dB"),
     "held_out_db": ("recorded view, held-out frames", "{:.1f} dB"),
     "held_out_ssim": ("the same, SSIM", "{:.3f}"),
-    "moving_db": ("the same, what moves", "{:.1f} dB"),
+    "moving_with_overlay_db": ("dynamic PSNR, recorded view", "{:.1f} dB"),
+    "moving_db": ("dynamic PSNR without overlay", "{:.1f} dB"),
+    "by_motion": ("moving pixels by motion", "{:.0%}"),
+    "by_overlay": ("moving pixels by overlay", "{:.0%}"),
     "unseen": ("never seen", "{:.1%}"),
     "angle_deg": ("change of the line of sight", "{:.1f}°"),
     "track_px": ("tracks to motion", "{:.1f} px"),
@@ -81,8 +85,8 @@ class ViewEntry:
     variant: int
     camera: str
     drawn: dict[str, float]  # the change of view
-    view: dict[str, Any]  # camera_from_source, distance_m, and scores if it was judged
-    rejected: list[str]  # reasons of the draws before
+    view: dict[str, Any]  # camera_from_source, distance_m, what_moves, and scores if it was judged
+    rejected: list[str]  # reasons of the samples before
     dropped: bool
     pictures: Pictures | None = None
 
@@ -106,6 +110,7 @@ def page(title: str, figures: dict[str, str], entries: Sequence[ViewEntry], skip
     left_out = ""
     if skipped:
         left_out = "<h2>Skipped episodes</h2>" + bullets(skipped)
+    moves = bullets(f"{camera}: {account_sentence(account)}" for camera, account in accounts_of(entries).items())
     more = len(entries) - min(len(entries), LISTED)
     rest = f"<p class=soft>{more} more are in meta/msdyn/episodes.parquet.</p>" if more else ""
     return (
@@ -114,11 +119,20 @@ def page(title: str, figures: dict[str, str], entries: Sequence[ViewEntry], skip
         f"<title>{text(title)}</title><style>{STYLE}</style></head><body><main>"
         f'<h1>{text(title)}</h1><p class="soft">Left and above: recorded. Right and below: rendered from the new '
         "camera. Scores are estimates: no true picture of the new views exists.</p>"
-        f'<div class="figures">{top}</div>{left_out}'
+        f'<div class="figures">{top}</div>{left_out}<h2>What moves</h2>{moves}'
         f"<h2>Views</h2>{''.join(_article(entry) for entry in shown[:LISTED])}"
         f'<h2>All views</h2><div class="scroll">{_table(entries[:LISTED])}</div>{rest}'
         "</main></body></html>\n"
     )
+
+
+def accounts_of(entries: Iterable[ViewEntry]) -> dict[str, Account]:
+    """Per camera, what renders the moving pixels of its recorded view, over all episodes."""
+    found = {(entry.camera, entry.episode): Account.from_entry(entry.view["what_moves"]) for entry in entries}
+    return {
+        camera: pooled([account for (name, _), account in found.items() if name == camera])
+        for camera in dict.fromkeys(camera for camera, _ in found)
+    }
 
 
 def text(value: object) -> str:
@@ -137,7 +151,7 @@ def _article(entry: ViewEntry) -> str:
     score = f"{scores['expected_db']:.1f} dB expected, {verdict}" if scores else verdict
     why = ""
     if entry.rejected:
-        name = "Why it was dropped" if entry.dropped else "Drawn again, since"
+        name = "Why it was dropped" if entry.dropped else "Sampled again, since"
         why = f'<p class="why">{name}:</p>{bullets(dict.fromkeys(entry.rejected))}'
     return (
         f'<article class="{verdict}"><div class="head"><h3>Episode {entry.episode}, variant {entry.variant}, '
@@ -204,17 +218,26 @@ def _frames(frames: Sequence[dict[str, Any]]) -> str:
 
 def _table(entries: Sequence[ViewEntry]) -> str:
     head = (
-        "<tr><th>episode</th><th>variant</th><th>camera</th><th>expected</th><th>never seen</th><th>redrawn</th>"
-        "<th>verdict</th></tr>"
+        "<tr><th>episode</th><th>variant</th><th>camera</th><th>expected</th><th>never seen</th><th>by motion</th>"
+        "<th>by overlay</th><th>dynamic PSNR</th><th>without overlay</th><th>resampled</th><th>verdict</th></tr>"
     )
     rows = []
     for entry in entries:
         scores = entry.view.get("scores")
         values = (f"{scores['expected_db']:.1f} dB", f"{scores['unseen']:.1%}") if scores else ("not judged", "")
         verdict = f"dropped: {entry.rejected[-1]}" if entry.dropped else "kept"
-        redrawn = len(entry.rejected) - int(entry.dropped)
+        resampled = len(entry.rejected) - int(entry.dropped)
+        moves = "".join(f"<td>{cell}</td>" for cell in _account_cells(entry.view["what_moves"]))
         rows.append(
             f"<tr><td>{entry.episode}</td><td>{entry.variant}</td><td>{text(entry.camera)}</td><td>{values[0]}</td>"
-            f'<td>{values[1]}</td><td>{redrawn}</td><td class="text">{text(verdict)}</td></tr>'
+            f'<td>{values[1]}</td>{moves}<td>{resampled}</td><td class="text">{text(verdict)}</td></tr>'
         )
     return f"<table>{head}{''.join(rows)}</table>"
+
+
+def _account_cells(account: dict[str, Any]) -> list[str]:
+    """By motion, by overlay, dynamic PSNR with and without overlay."""
+    if account["pixels"] == 0:
+        return ["nothing moves", "", "", ""]
+    shares = [f"{account[name]:.0%}" for name in ("by_motion", "by_overlay")]
+    return [*shares, *(f"{account[name]:.1f} dB" for name in ("dynamic_db", "dynamic_without_overlay_db"))]

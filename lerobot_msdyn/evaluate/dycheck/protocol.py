@@ -43,11 +43,15 @@ def evaluate_dycheck(config: DycheckConfig) -> Evaluated:
         _use_priors(config, sequence)
     scene = timed_reconstruction(seconds, sequence.view, config)
     with timed(seconds, "render"):
-        drawn = draw_validation(scene, sequence, config.out / "rgb")
+        drawn = render_validation(scene, sequence, config.out / "rgb")
+        alone = render_validation(scene.without_overlay(), sequence)
     with timed(seconds, "score"):
         missing = without_lpips()
         network = None if missing else lpips_network()
-        images = {name: _score(sequence, name, picture, network) for name, picture in drawn.items()}
+        images, without = (
+            {name: _score(sequence, name, picture, network) for name, picture in pictures.items()}
+            for pictures in (drawn, alone)
+        )
         shown = sequence.view.rgb.numpy()
         unchanged = [
             _score(sequence, name, shown[frame], network)
@@ -55,21 +59,29 @@ def evaluate_dycheck(config: DycheckConfig) -> Evaluated:
         ]
     empty = sum(math.isnan(scores["mpsnr"]) for scores in images.values())
     notices = [missing, f"{empty} of {len(images)} masks are empty: without mPSNR" if empty else ""]
-    rows = {"this fit": mean_scores([*images.values()]), "recorded picture of that time": mean_scores(unchanged)}
+    rows = {
+        "this fit": mean_scores([*images.values()]),
+        "this fit without overlay": mean_scores([*without.values()]),
+        "recorded picture of that time": mean_scores(unchanged),
+    }
     content: dict[str, Any] = {
         "sequence": config.root.name,
         "protocol": config.protocol,
         "mean": rows,
         "images": images,
+        "what_moves": scene.account.entry(),
     }
     content |= {"seconds": seconds, "pictures": len(images), "notices": [notice for notice in notices if notice]}
     table = score_table(rows, f"{config.root.name}, protocol {config.protocol}")
     return Evaluated(content, table, config.out).written()
 
 
-def draw_validation(scene: Reconstruction, sequence: IphoneSequence, out: Path) -> dict[str, UInt8[ndarray, "h w 3"]]:
-    """The scene through the validation cameras, by picture; written to `out` as <id>.png."""
-    out.mkdir(parents=True, exist_ok=True)
+def render_validation(
+    scene: Reconstruction, sequence: IphoneSequence, out: Path | None = None
+) -> dict[str, UInt8[ndarray, "h w 3"]]:
+    """The scene through the validation cameras, by picture; written to `out`, if there is one, as <id>.png."""
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
     drawn = {}
     cameras = np.array([name.split("_")[0] for name in sequence.validation])
     for camera in dict.fromkeys(cameras.tolist()):  # each stands still
@@ -78,7 +90,8 @@ def draw_validation(scene: Reconstruction, sequence: IphoneSequence, out: Path) 
         pictures = new_pictures(scene, sequence.cameras.select(mine.tolist()), frames)
         for i, picture in zip(mine.tolist(), pictures, strict=True):
             drawn[sequence.validation[i]] = picture.rgb
-            cv2.imwrite(str(out / f"{sequence.validation[i]}.png"), picture.rgb[..., ::-1])
+            if out is not None:
+                cv2.imwrite(str(out / f"{sequence.validation[i]}.png"), picture.rgb[..., ::-1])
     return drawn
 
 
