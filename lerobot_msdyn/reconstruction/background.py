@@ -12,6 +12,7 @@ from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.geometry import matrix_to_quaternion, transform_points, unproject_image
+from lerobot_msdyn.core.images import masked_median, nearest_of
 from lerobot_msdyn.core.sampling import evenly, scaled_px
 from lerobot_msdyn.scene.gaussians import Gaussians, gaussians_from_points
 
@@ -81,19 +82,9 @@ def _median_of(
     """Median colour and depth of some pixels over those of some frames in which they are still; how many these are."""
     rows = np.ix_(frames, pixels)
     values = np.concatenate((colours[rows], depths[rows][..., None]), axis=-1, dtype=np.float32)
-    return _masked_median(values, still[rows]), still[rows].sum(0)
-
-
-def _masked_median(values: Float32[ndarray, "t p c"], usable: Bool[ndarray, "t p"]) -> Float32[ndarray, "p c"]:
-    """Median over usable frames, of the last channel over those in which it is not 0; 0 where there is none."""
-    usable = np.repeat(usable[..., None], values.shape[-1], axis=-1)
-    usable[..., -1] &= values[..., -1] > 0
-    ordered = np.sort(np.where(usable, values, np.float32(np.inf)), axis=0)
-    count = usable.sum(0)
-    middle = [
-        np.take_along_axis(ordered, at.clip(0, len(values) - 1)[None], 0)[0] for at in ((count - 1) // 2, count // 2)
-    ]
-    return np.where(count > 0, (middle[0] + middle[1]) / 2, np.float32(0)).astype(np.float32)
+    usable = np.repeat(still[rows][..., None], values.shape[-1], axis=-1)
+    usable[..., -1] &= values[..., -1] > 0  # a depth of 0 is unknown
+    return masked_median(values, usable), still[rows].sum(0)
 
 
 def fill_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
@@ -101,12 +92,7 @@ def fill_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     known = (depth > 0).numpy()
     if not known.any():
         return torch.ones_like(depth)
-    _, labels = cv2.distanceTransformWithLabels(
-        (~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    values = np.zeros(labels.max() + 1, np.float32)
-    values[labels[known]] = depth.numpy()[known]
-    return torch.from_numpy(values[labels])
+    return torch.from_numpy(depth.numpy().ravel()[nearest_of(known)])
 
 
 def surface_frames(points: Float[Tensor, "h w 3"]) -> tuple[Float[Tensor, "h w 3 3"], Float[Tensor, "h w"]]:

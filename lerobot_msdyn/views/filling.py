@@ -12,6 +12,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.core.config import Fill
+from lerobot_msdyn.core.images import nearest_of
 from lerobot_msdyn.views.coverage import HOLE_ALPHA
 
 SOLID_ALPHA = 0.9  # from this opacity on a surface is shown as it is; below, what is behind shines through
@@ -50,7 +51,7 @@ def filled(
         unusable = holes
     picture = (whole * 255).round().to(torch.uint8).numpy()
     if fill == "nearest":
-        continued = _nearest(picture, unusable)
+        continued = picture.reshape(-1, 3)[nearest_of(~unusable)]
     else:
         continued = cv2.inpaint(picture, unusable.astype(np.uint8), INPAINT_RADIUS_PX, cv2.INPAINT_TELEA)
     return torch.where(torch.from_numpy(holes)[..., None], torch.from_numpy(continued).float() / 255, whole)
@@ -105,12 +106,3 @@ def _inside(holes: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
     _, labels = cv2.connectedComponents(holes.astype(np.uint8))
     touching = np.unique(np.concatenate((labels[0], labels[-1], labels[:, 0], labels[:, -1])))
     return holes & ~np.isin(labels, touching[touching > 0])
-
-
-def _nearest(picture: ndarray, unusable: Bool[ndarray, "h w"]) -> ndarray:
-    """Every unusable pixel in the colour of the nearest usable one."""
-    mask = unusable.astype(np.uint8)
-    _, labels = cv2.distanceTransformWithLabels(mask, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    colours = np.zeros((labels.max() + 1, 3), np.uint8)
-    colours[labels[~unusable]] = picture[~unusable]
-    return np.asarray(colours[labels])

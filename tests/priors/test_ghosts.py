@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lerobot_msdyn.priors.masks.ghosts import without_ghosts
+from lerobot_msdyn.priors.masks.ghosts import median_where, without_ghosts
 
 FRAMES = 20
 
@@ -39,3 +39,18 @@ def test_what_keeps_moving_is_no_ghost(sliding) -> None:
     rgb, mask = sliding.rgb.numpy()[8:20], sliding.mask.numpy()[8:20]
     _, changed = without_ghosts(rgb, mask, sliding.empty.round().astype(np.uint8), stride=1.0)
     assert not changed.any()
+
+
+def test_the_median_is_taken_over_the_usable_frames_of_the_region() -> None:
+    rng = np.random.default_rng(0)
+    frames = rng.integers(0, 256, (9, 6, 8, 3), dtype=np.uint8)
+    usable = rng.random((9, 6, 8)) < 0.5
+    usable[:, 0, 0] = False
+    where = np.ones((6, 8), bool)
+    where[:, 7] = False
+    otherwise = np.full((6, 8, 3), 7, np.uint8)
+    found = median_where(frames, usable, where, otherwise)
+    for y, x in np.argwhere(where & usable.any(0)):
+        assert (found[y, x] == np.median(frames[usable[:, y, x], y, x], axis=0).round()).all()
+    assert (found[0, 0] == 7).all()
+    assert (found[:, 7] == 7).all()

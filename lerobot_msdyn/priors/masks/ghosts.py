@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Int, UInt8
 from numpy import ndarray
 
+from lerobot_msdyn.core.images import masked_median, nearest_of
 from lerobot_msdyn.priors.masks.change import to_lab
-from lerobot_msdyn.priors.medians import median_where
 
 _REST_FRAMES = 8  # of the clip, for which a place has to look the same
 _STILL = 6  # grey levels up to which two pictures of a place look the same
@@ -46,6 +46,19 @@ def without_ghosts(
             continue
         mended[inside], changed[inside] = seen[inside], True
     return mended, changed
+
+
+def median_where(
+    frames: UInt8[ndarray, "t h w 3"],
+    usable: Bool[ndarray, "t h w"],
+    where: Bool[ndarray, "h w"],
+    otherwise: UInt8[ndarray, "h w 3"],
+) -> UInt8[ndarray, "h w 3"]:
+    """Median colour of every pixel of a region over the frames in which it is usable; elsewhere `otherwise`."""
+    out = otherwise.copy()
+    where = where & usable.any(0)
+    out[where] = masked_median(frames[:, where], usable[:, where, None]).round().astype(np.uint8)
+    return out
 
 
 def _resting(
@@ -93,10 +106,7 @@ def _goes_on(
     if around.sum() < _MIN_OUTLINE:
         return False
     rim = inside & (cv2.erode(mask, wide) == 0)
-    _, index = cv2.distanceTransformWithLabels((~rim).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    nearest = np.zeros(index.max() + 1, int)
-    nearest[index[rim]] = np.flatnonzero(rim)
-    across = nearest[index[around]]
+    across = nearest_of(rim)[around]
 
     def edge(image: ndarray) -> ndarray:
         step = np.linalg.norm(empty[around] - image.reshape(-1, 3)[across], axis=-1)

@@ -5,6 +5,8 @@ import numpy as np
 from jaxtyping import Bool, Int, UInt8
 from numpy import ndarray
 
+from lerobot_msdyn.core.images import nearest_of
+
 MAX_INSTANCES = 8
 _MIN_INSTANCE_AREA = 1e-3  # of the image, while it is seen; smaller instances are dropped
 _MIN_LIFE = 5  # frames; instances seen in fewer are dropped
@@ -33,21 +35,11 @@ def _linked(frames: UInt8[ndarray, "t h w 3"], moving: Bool[ndarray, "t h w"]) -
             inside = components == component
             known = carried * inside
             if known.any():
-                labels[t][inside] = _nearest(known)[inside]
+                labels[t][inside] = known.ravel()[nearest_of(known > 0)[inside]]
             else:
                 used += 1
                 labels[t][inside] = used
     return labels
-
-
-def _nearest(labels: Int[ndarray, "h w"]) -> Int[ndarray, "h w"]:
-    """Every pixel with the label of the nearest labelled one."""
-    _, index = cv2.distanceTransformWithLabels(
-        (labels == 0).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    lookup = np.zeros(index.max() + 1, labels.dtype)
-    lookup[index[labels > 0]] = labels[labels > 0]
-    return lookup[index]
 
 
 def _number(labels: Int[ndarray, "t h w"]) -> UInt8[ndarray, "t h w"]:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 from numpy import ndarray
 
+from lerobot_msdyn.core.images import masked_median
 from lerobot_msdyn.priors.masks.change import Reference, along_edges
 
 _OFFSETS = (-12, -8, -4, 4, 8, 12)  # frames that are laid over a frame; together they show its background
@@ -32,12 +33,9 @@ def residual_odds(frames: UInt8[ndarray, "t h w 3"]) -> Float32[ndarray, "t h w"
         pictures = [picture for picture in laid if picture is not None]
         if len(pictures) < _MIN_SEEN:
             continue
-        stack: np.ma.MaskedArray = np.ma.masked_array(
-            np.stack([picture for picture, _ in pictures]),
-            np.stack([np.broadcast_to(~seen[..., None], picture.shape) for picture, seen in pictures]),
-        )
-        background = np.ma.median(stack, axis=0).filled(0).astype(np.uint8)
-        known = (~stack.mask[..., 0]).sum(0) >= _MIN_SEEN
+        seen = np.stack([inside for _, inside in pictures])
+        background = masked_median(np.stack([picture for picture, _ in pictures]), seen[..., None]).astype(np.uint8)
+        known = seen.sum(0) >= _MIN_SEEN
         odds = Reference(background, np.full(known.shape, _NOISE_FLOOR, np.float32)).change(frames[t])
         out[t] = np.where(known, along_edges(odds, frames[t]), 0)
     return out

@@ -18,8 +18,8 @@ from jaxtyping import Bool, Float32, Int, UInt8
 from numpy import ndarray
 from torch import Tensor
 
+from lerobot_msdyn.core.images import box_about
 from lerobot_msdyn.core.observations import PointTracks
-from lerobot_msdyn.priors.boxes import box_about
 from lerobot_msdyn.priors.tracks.patches import Patches, cut, register, sample
 
 PairFlow = Callable[[ndarray, ndarray], ndarray]
