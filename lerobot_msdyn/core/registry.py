@@ -95,17 +95,6 @@ class Registry[T]:
                 return name
         raise ValueError(f"{implementation} is no registered {self.kind}")
 
-    def name_of(self, implementation: T) -> str:
-        """The name of one that was registered.
-
-        Raises:
-            ValueError: it was not.
-        """
-        for name, known in self._known.items():
-            if known is implementation:
-                return name
-        raise ValueError(f"{implementation} is no registered {self.kind}")
-
     def all(self) -> dict[str, T]:
         """All implementations by name; imports them."""
         return {name: self.get(name) for name in self.names()}

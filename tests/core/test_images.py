@@ -43,7 +43,7 @@ def test_nearest_marked_pixel_by_brute_force() -> None:
 @pytest.mark.parametrize("kind", [np.uint8, np.float32])
 def test_median_is_over_the_usable_frames(kind: type) -> None:
     rng = np.random.default_rng(0)
-    values = rng.integers(0, 256, (9, 48, 3)).astype(kind)
+    values: np.ndarray = rng.integers(0, 256, (9, 48, 3)).astype(kind)
     usable = rng.random((9, 48)) < 0.5
     usable[:, 0], usable[:, 1] = False, True
     found = masked_median(values, usable[..., None])

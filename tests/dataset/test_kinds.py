@@ -27,7 +27,7 @@ from lerobot_msdyn.dataset.write import NewEpisode, OutputDataset
 FRONT, SIDE = "observation.images.front", "observation.images.side"
 LENGTHS = (4, 5, 3, 2)
 AXES = ["height", "width", "channels"]
-RECORDED = {
+RECORDED: dict[str, dict[str, Any]] = {
     "action": {"dtype": "float32", "shape": (2,), "names": None},
     "observation.matrix": {"dtype": "float64", "shape": (2, 3), "names": None},
     "observation.counts": {"dtype": "int16", "shape": (3,), "names": None},
@@ -136,6 +136,7 @@ def test_grey_and_four_channel_images(channels: int, tmp_path: Path) -> None:
         cells = []
         for cell in table[FRONT].to_pylist():
             image = cv2.imdecode(np.frombuffer(cell["bytes"], np.uint8), cv2.IMREAD_COLOR)
+            assert image is not None
             grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
             cells.append({"bytes": encode_image(grey, ".png"), "path": cell["path"]})
             if channels == 4:

@@ -62,7 +62,7 @@ def test_a_term_of_ones_own_sees_the_scene_and_is_minimised(monkeypatch: pytest.
         seen.append(step)
         return step.scene.static.log_scales.exp().mean()
 
-    monkeypatch.setitem(LOSSES._known, "small", small)
+    monkeypatch.setitem(LOSSES._registered, "small", small)
     view, priors = still_video()
     config = FitConfig(steps=6, weights={"small": 10.0})
     scene = grey_scene(view)
