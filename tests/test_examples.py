@@ -17,6 +17,7 @@ SAYS = {
     "05_train_mixed.py": r"4 updates, 2 epochs, loss \d",
     "06_held_out_camera.py": r"(?s)\d dB\n.*\d dB\n",
     "07_export_scene.py": r"frame_000000.ply to frame_000007.ply",
+    "08_own_motion_level.py": r"\d parts, [1-9]\d* cells, \d+ moving Gaussians",
 }
 
 

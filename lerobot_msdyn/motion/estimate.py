@@ -168,17 +168,17 @@ def _parts_of(motion: SceneMotion, tracks: LiftedTracks) -> Int[Tensor, " n"]:
     votes = torch.zeros(len(tracks.xyz), count)
     at_canonical = torch.zeros(len(tracks.xyz), 3)
     seen = tracks.valid.cumsum(1)
-    for share in torch.linspace(0, 1, _VOTING_FRAMES + 2)[1:-1].tolist():
-        at = (seen >= (share * seen[:, -1:]).clamp(min=1)).int().argmax(1)
+    for quantile in torch.linspace(0, 1, _VOTING_FRAMES + 2)[1:-1].tolist():
+        at = (seen >= (quantile * seen[:, -1:]).clamp(min=1)).int().argmax(1)
         for frame in at.unique().tolist():
             rows = (at == frame).nonzero()[:, 0]
-            at_canonical[rows], found = motion.to_canonical(tracks.xyz[rows, frame], frame, tracks.instance[rows])
-            votes[rows, found] += 1
+            at_canonical[rows], voted = motion.to_canonical(tracks.xyz[rows, frame], frame, tracks.instance[rows])
+            votes[rows, voted] += 1
     part = votes.argmax(1)
     for k in range(count):
-        own = motion.points[motion.part == k]
-        if len(own) and not bool((part == k).any()):
-            part[(at_canonical - own.mean(0)).norm(dim=-1).argmin()] = k
+        members = motion.points[motion.part == k]
+        if len(members) and not bool((part == k).any()):
+            part[(at_canonical - members.mean(0)).norm(dim=-1).argmin()] = k
     return part
 
 
@@ -203,8 +203,8 @@ def near_canonical(
     """Mean position about the canonical frame, or about the nearest frame in which a track was seen."""
     apart = (torch.arange(positions.shape[1]) - canonical).abs().expand(weights.shape)
     nearest = torch.where(weights > 0, apart, 10**9).amin(1, keepdim=True)
-    share = weights * torch.exp(-(apart - nearest).clamp(min=0) / _CANONICAL_FRAMES)
-    return torch.einsum("nt,ntc->nc", share, positions) / share.sum(1, keepdim=True).clamp(min=1e-12)
+    nearness = weights * torch.exp(-(apart - nearest).clamp(min=0) / _CANONICAL_FRAMES)
+    return torch.einsum("nt,ntc->nc", nearness, positions) / nearness.sum(1, keepdim=True).clamp(min=1e-12)
 
 
 def _longest(valid: Bool[Tensor, "n t"], instance: Int[Tensor, " n"]) -> Int[Tensor, " m"]:

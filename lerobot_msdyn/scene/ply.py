@@ -33,18 +33,18 @@ def gaussians_at(scene: DynamicScene, frame: int) -> Gaussians:
     degree = max(colours.shape[1] for colours in sh)
     sh = [torch.nn.functional.pad(colours, (0, 0, 0, degree - colours.shape[1])) for colours in sh]
     log_scales = [part.log_scales.expand(-1, 3) for part in (static, moving)]
-    own = concatenate(
+    whole = concatenate(
         [
             Gaussians(static.means, static.quats, log_scales[0], static.opacity_logits, sh[0]),
             Gaussians(means[0], quats[0], log_scales[1], moving.opacity_logits, sh[1]),
         ]
     )
     if scene.overlay is None:
-        return own
-    patch = scene.overlay.patch(frame, len(own))
+        return whole
+    patch = scene.overlay.patch(frame, len(whole))
     shown = gaussians_from_points(patch.means, patch.quats, patch.log_scales.exp(), patch.rgb, PATCH_OPACITY)
     flat = torch.nn.functional.pad(shown.sh, (0, 0, 0, degree - 1))
-    return concatenate([own.select(~patch.hidden), replace(shown, sh=flat)])
+    return concatenate([whole.select(~patch.hidden), replace(shown, sh=flat)])
 
 
 def _turned(sh: Float[Tensor, "m k 3"], turn: Float[Tensor, "m 3 3"]) -> Float[Tensor, "m k 3"]:

@@ -41,9 +41,9 @@ def render_scene(
     if scene.overlay is None:
         camera, frames = to_device((camera, frames), scene.device)
         return _rasterized(_snapshot(scene, camera, frames, extra), camera, scene.near, backend)
-    own = len(scene.static) + len(scene.moving)
+    gaussians = len(scene.static) + len(scene.moving)
     parts = [
-        render_patched(scene, camera.select([i]), frame, scene.overlay.patch(frame, own), backend, extra)
+        render_patched(scene, camera.select([i]), frame, scene.overlay.patch(frame, gaussians), backend, extra)
         for i, frame in enumerate(frames.tolist())
     ]
     names = [item.name for item in fields(Rendering) if getattr(parts[0], item.name) is not None]

@@ -51,11 +51,11 @@ def _between(codes: UInt8[Tensor, "t *any"], times: Tensor) -> Float[Tensor, "b 
     """Codes at times between frames; held before the first and after the last."""
     time = times.to(codes.device).float().clamp(0, len(codes) - 1)
     before = time.floor().long()
-    share = (time - before).reshape(-1, *[1] * (codes.dim() - 1))
+    fraction = (time - before).reshape(-1, *[1] * (codes.dim() - 1))
     first = codes[before].float()
-    if not share.is_cuda and not bool(share.any()):  # on a GPU, waiting for the answer takes longer
+    if not fraction.is_cuda and not bool(fraction.any()):  # on a GPU, waiting for the answer takes longer
         return first
-    return torch.lerp(first, codes[(before + 1).clamp(max=len(codes) - 1)].float(), share)
+    return torch.lerp(first, codes[(before + 1).clamp(max=len(codes) - 1)].float(), fraction)
 
 
 def no_shading(static: int, moving: int, frames: int) -> Shading:

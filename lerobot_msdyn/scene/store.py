@@ -175,11 +175,11 @@ def list_scenes(folder: Path) -> dict[int, dict[str, Path]]:
     Raises:
         MsdynError: there are none.
     """
-    found: dict[int, dict[str, Path]] = {}
+    folders: dict[int, dict[str, Path]] = {}
     for header in sorted(scenes_root(folder).glob(f"episode_*/*/{_HEADER}")):
         episode = int(header.parent.parent.name.removeprefix("episode_"))
-        found.setdefault(episode, {})[header.parent.name] = header.parent
-    return found
+        folders.setdefault(episode, {})[header.parent.name] = header.parent
+    return folders
 
 
 def save_scene(scene: DynamicScene, path: Path) -> None:

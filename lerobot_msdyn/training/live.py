@@ -73,8 +73,8 @@ class _LiveWindow:
         self._rgb = torch.cat((static.rgb, moving.rgb, torch.zeros(room, 3)))
         self._shown = torch.cat((self._opacities, torch.full((room,), PATCH_OPACITY)))
         self._levels = [i for i, level in enumerate(scene.levels) if not _is_idle(level)]
-        self._posable = all(isinstance(scene.levels[i], MotionLevel) for i in self._levels)
-        if self._posable:
+        self._only_bases = all(isinstance(scene.levels[i], MotionLevel) for i in self._levels)
+        if self._only_bases:
             self._prepare_bases()
 
     def _prepare_bases(self) -> None:
@@ -97,7 +97,7 @@ class _LiveWindow:
     def size_in_bytes(self) -> int:
         """Memory of the buffers."""
         shown = (self._static_rgb, self._scales, self._opacities, self._shown, self._means, self._quats, self._rgb)
-        bases = (self._affines, self._indices, self._weights, self._sh) if self._posable else ()
+        bases = (self._affines, self._indices, self._weights, self._sh) if self._only_bases else ()
         return sum(array.nbytes for array in (*shown, *bases))
 
     @torch.no_grad()
@@ -144,7 +144,7 @@ class _LiveWindow:
     def _set_moving(self, time: Int[Tensor, " 1"], eye: Tensor) -> None:
         """Write positions, orientations and colours of the moving set at a time into the buffers."""
         moving = slice(self._static, self._own)
-        if not self._posable:
+        if not self._only_bases:
             unlit = replace(self._scene, shading=None)
             snapshot = unlit.at(time, eye[None])
             for buffer, values in ((self._means, snapshot.means), (self._quats, snapshot.quats)):

@@ -1,4 +1,4 @@
-"""Residual motions: robust, drawn to the identity, and guarded where tracks fix no rotation."""
+"""Residual motions: robust, pulled to the identity, and guarded where tracks fix no rotation."""
 
 import torch
 from torch import Tensor
@@ -68,7 +68,7 @@ def test_outliers_do_not_count() -> None:
     torch.testing.assert_close(solved(points, positions)[1, :3, :3], TURN.double(), atol=5e-3, rtol=0)
 
 
-def test_noise_draws_to_the_identity() -> None:
+def test_noise_pulls_to_the_identity() -> None:
     points = cloud(count=8)
     positions = points[:, None] + 0.03 * torch.randn(8, FRAMES, 3, generator=torch.Generator().manual_seed(2))
     free = solved(points, positions, noise=0.03, shrink=False)

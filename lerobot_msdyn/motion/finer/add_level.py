@@ -31,9 +31,9 @@ _QUERY_REACH = 4  # ... in frames farther away than this ...
 _JUDGED_FRAMES = 60  # ... of so many
 _WORTH = 0.01  # of the error, that a level must take away
 _VISIBLE_PX = 0.3  # that a level must explain: less is not seen, and the drift of the tracks themselves
-_SURE = 3.0  # standard errors that the gain must be: some ten pairs of part and level are judged per episode
+_SURE = 3.0  # standard errors that the gain must be: about ten pairs of part and level are judged per episode
 
-Approve = Callable[[MotionLevel], Bool[Tensor, " p"]]  # parts in which a level agrees with what else is known
+Approve = Callable[[MotionLevel], Bool[Tensor, " p"]]  # parts in which a level agrees with the video
 
 
 def add_level(
@@ -76,22 +76,22 @@ def add_level(
             judges = fold == k
             gains[row, judges] = _gain(uniform, indices[judges], logits[judges], tracks.select(judges), canonical)
     smoothing = _best_smoothing(gains, indices, logits, len(places))
-    found = level(solved(torch.ones_like(fold, dtype=torch.bool)), smoothing)
+    fitted = level(solved(torch.ones_like(fold, dtype=torch.bool)), smoothing)
     if config.gate:
         error, gain = torch.zeros(2, len(fold))
         for k, trial in enumerate(trials):
             judged = _prediction(level(trial, smoothing), name, fold == k, tracks, seen, so_far)
             error[fold == k], gain[fold == k] = judged
-        kept = torch.zeros(len(found), dtype=torch.bool)
+        kept = torch.zeros(len(fitted), dtype=torch.bool)
         proven = _proven(error, gain, tracks.part, _VISIBLE_PX * seen.pixel_m)
         if approve is not None and bool(proven.any()):
-            proven &= approve(found)[: len(proven)]
+            proven &= approve(fitted)[: len(proven)]
         kept[owner[proven[tracks.part]]] = True
         coarser = so_far.levels[-1]
         if spec.refines and isinstance(coarser, MotionLevel):
-            kept &= coarser.active[found.parents.clamp(min=0)]
-        found = replace(found, active=found.active & kept)
-    return found, replace(tracks, positions=pull_back(found, indices, logits, tracks.positions), owner=owner)
+            kept &= coarser.active[fitted.parents.clamp(min=0)]
+        fitted = replace(fitted, active=fitted.active & kept)
+    return fitted, replace(tracks, positions=pull_back(fitted, indices, logits, tracks.positions), owner=owner)
 
 
 def _clusters(

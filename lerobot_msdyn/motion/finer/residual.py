@@ -62,7 +62,7 @@ def solve_residual(
 ) -> Float[Tensor, "k t 4 4"]:
     """The motion of every basis, from its tracks' canonical points to where the coarser levels leave them to go.
 
-    Robust weighted Procrustes as at the object level, but drawn to the identity, the right prior for what is left over
+    Robust weighted Procrustes as at the object level, but pulled to the identity, the right prior for what is left over
     (see `_procrustes`). Too few or collinear tracks fix no rotation; frames without tracks copy the nearest one with
     some.
 
@@ -77,7 +77,7 @@ def solve_residual(
         indices: bases that every track follows.
         logits: their weights before the softmax.
         noise: standard deviation of a position along one axis, m.
-        shrink: whether rotations are drawn to the identity.
+        shrink: whether rotations are pulled to the identity.
         turn: whether the bases turn as well as shift.
     """
     count, n = len(places), len(tracks.points)
@@ -192,8 +192,8 @@ def _procrustes(
         fixed = (effective[..., 0] >= _MIN_EFFECTIVE) & (extent[..., 1] > _COLLINEAR * extent[..., 2])
         prior = (sigma[:, None] / _USUAL_TURN).square() / effective[..., 0].clamp(min=1)
         wanted = old @ spread + miss_x - miss_mean[..., :, None] * x_mean[..., None, :]
-        found = nearest_rotation(wanted + prior[..., None, None] * rotation)
-        rotation = torch.where(fixed[..., None, None], found, rotation)
+        best = nearest_rotation(wanted + prior[..., None, None] * rotation)
+        rotation = torch.where(fixed[..., None, None], best, rotation)
     solved = se3(rotation, y_mean - (rotation @ x_mean[..., None])[..., 0])
     return _nearest_solved(solved, total[..., 0] > 1e-9)
 

@@ -26,12 +26,12 @@ def filled(positions: Float[Tensor, "n t 3"], valid: Bool[Tensor, "n t"]) -> Flo
     after = torch.where(valid, time, frames).flip(1).cummin(dim=1).values.flip(1)
     start = torch.where(before < 0, after, before).clamp(max=frames - 1)
     end = torch.where(after >= frames, before, after).clamp(min=0)
-    share = ((time - start) / (end - start).clamp(min=1)).clamp(0, 1)[..., None].to(positions)
+    fraction = ((time - start) / (end - start).clamp(min=1)).clamp(0, 1)[..., None].to(positions)
 
     def at(index: Int[Tensor, "n t"]) -> Float[Tensor, "n t 3"]:
         return positions.gather(1, index[..., None].expand(-1, -1, 3))
 
-    return torch.lerp(at(start), at(end), share)
+    return torch.lerp(at(start), at(end), fraction)
 
 
 def direction_features(
@@ -94,7 +94,7 @@ def k_means(features: Float[Tensor, "n f"], count: int, least: int, seed: int = 
 
 
 def _far_apart(features: Float[Tensor, "n f"], count: int, generator: torch.Generator) -> Float[Tensor, "k f"]:
-    """k-means++: each further centre is drawn in proportion to its squared distance from those before it."""
+    """k-means++: each further centre is sampled in proportion to its squared distance from those before it."""
     chosen = [int(torch.randint(len(features), (1,), generator=generator))]
     nearest = (features - features[chosen[0]]).square().sum(-1)
     for _ in range(count - 1):

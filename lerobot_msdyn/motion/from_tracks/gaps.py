@@ -29,13 +29,13 @@ def find_carriers(
 def _carrier(
     part: int, motions: Float[Tensor, "k t 4 4"], accepted: Bool[Tensor, "k t"], pivot: Float[Tensor, "3"]
 ) -> int:
-    own = accepted[part]
-    if own.all() or not own.any():
+    followed = accepted[part]
+    if followed.all() or not followed.any():
         return STILL
-    gap = (~own).float()
+    gap = (~followed).float()
     near = torch.nn.functional.max_pool1d(gap[None], 2 * _WINDOW + 1, stride=1, padding=_WINDOW)[0] > 0
-    start = (near & own)[:-_STEP].nonzero()[:, 0]
-    start = start[own[start + _STEP]]
+    start = (near & followed)[:-_STEP].nonzero()[:, 0]
+    start = start[followed[start + _STEP]]
     if len(start) == 0:
         return STILL
     place = (motions[part, :, :3, :3] @ pivot) + motions[part, :, :3, 3]  # of the part, at every frame
@@ -43,7 +43,7 @@ def _carrier(
     best, least = STILL, _CLEARLY * float(moved.norm(dim=-1).mean())
     for other in range(len(motions)):
         together = accepted[other, start] & accepted[other, start + _STEP]
-        covers = (accepted[other] & ~own).sum() >= _MIN_COVERED * (~own).sum()
+        covers = (accepted[other] & ~followed).sum() >= _MIN_COVERED * (~followed).sum()
         if other == part or not covers or together.sum() < len(start) / 2:
             continue
         step = motions[other, start + _STEP] @ invert_se3(motions[other, start])
@@ -66,12 +66,12 @@ def fill_gaps(
     the next one backward, mixed in proportion (slerp, and lerp of the pivot). Beyond the first and last accepted
     frames there is only one side.
     """
-    known = accepted.nonzero()[:, 0]
-    if len(known) == 0:
+    supported = accepted.nonzero()[:, 0]
+    if len(supported) == 0:
         return torch.eye(4, dtype=motions.dtype).repeat(len(motions), 1, 1)
     time = torch.arange(len(motions))
-    after = known[torch.searchsorted(known, time).clamp(max=len(known) - 1)]
-    before = known[(torch.searchsorted(known, time, right=True) - 1).clamp(min=0)]
+    after = supported[torch.searchsorted(supported, time).clamp(max=len(supported) - 1)]
+    before = supported[(torch.searchsorted(supported, time, right=True) - 1).clamp(min=0)]
     fraction = ((time - before) / (after - before).clamp(min=1)).clamp(0, 1).to(motions.dtype)[:, None]
     start, end = motions[before], motions[after]
     if carry is not None:

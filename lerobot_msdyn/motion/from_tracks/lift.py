@@ -65,10 +65,10 @@ def position_noise(xyz: Float[Tensor, "n t 3"], valid: Bool[Tensor, "n t"]) -> f
 
 def near_depth_edge(depth: Float32[ndarray, "h w"], margin_px: int = _EDGE_MARGIN_PX) -> Bool[ndarray, "h w"]:
     """Pixels within `margin_px` (at least 1) of a depth edge; unknown depth is no edge."""
-    known = depth > 0
+    measured = depth > 0
     window = np.ones((3, 3), np.uint8)
-    far = cv2.dilate(np.where(known, depth, 0).astype(np.float32), window)
-    near = cv2.erode(np.where(known, depth, np.inf).astype(np.float32), window)
+    far = cv2.dilate(np.where(measured, depth, 0).astype(np.float32), window)
+    near = cv2.erode(np.where(measured, depth, np.inf).astype(np.float32), window)
     edge = (far / (1 + _EDGE_JUMP) > near).astype(np.uint8)
     side = 2 * margin_px - 1  # the window above reaches one pixel already
     return cv2.dilate(edge, np.ones((side, side), np.uint8)) > 0

@@ -18,13 +18,13 @@ def canonical_frame(valid: Bool[Tensor, "n t"], instance: Int[Tensor, " n"]) -> 
     Ties go to the frame with more tracks, then to the one nearest the middle of the clip.
     """
     frames = valid.shape[1]
-    share = torch.zeros(frames, dtype=torch.float64)
+    coverage = torch.zeros(frames, dtype=torch.float64)
     for label in instance.unique():
         seen = valid[instance == label].sum(0).double()
-        share += seen / seen.max().clamp(min=1)
+        coverage += seen / seen.max().clamp(min=1)
     total = valid.sum(0).double()
     middle = (torch.arange(frames) - (frames - 1) / 2).abs()
-    ranking = sorted(range(frames), key=lambda t: (-round(share[t].item(), 9), -total[t].item(), middle[t].item()))
+    ranking = sorted(range(frames), key=lambda t: (-round(coverage[t].item(), 9), -total[t].item(), middle[t].item()))
     return ranking[0]
 
 
@@ -83,9 +83,9 @@ def _fit_part(
     xyz: Float[Tensor, "n t 3"], weights: Float[Tensor, "n t"], carry: Float[Tensor, "t 4 4"] | None
 ) -> _PartFit:
     fit = fit_rigid(xyz, weights[None], carry=None if carry is None else carry[None])
-    points, known = model_points(xyz, weights, fit)
-    seen = known[0] if known.any() else torch.ones_like(known[0])
-    return _PartFit(fit.motions[0], fit.support[0] > 0, points[0, seen].mean(0))
+    points, observed = model_points(xyz, weights, fit)
+    used = observed[0] if observed.any() else torch.ones_like(observed[0])
+    return _PartFit(fit.motions[0], fit.support[0] > 0, points[0, used].mean(0))
 
 
 def _canonical_points(

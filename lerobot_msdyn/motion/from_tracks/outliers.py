@@ -39,11 +39,11 @@ def coherence(
             continue
         deviation, spread = torch.zeros(2, len(rows), valid.shape[1])
         near = torch.cdist(points[rows], points[rows]).topk(_NEIGHBOURS + 1, largest=False).indices[:, 1:]
-        for some in torch.arange(len(rows)).split(_CHUNK):
-            around = moved[rows[near[some]]]
+        for chunk in torch.arange(len(rows)).split(_CHUNK):
+            around = moved[rows[near[chunk]]]
             middle = around.median(dim=1).values
-            spread[some] = (around - middle[:, None]).norm(dim=-1).median(dim=1).values
-            deviation[some] = (moved[rows[some]] - middle).norm(dim=-1)
+            spread[chunk] = (around - middle[:, None]).norm(dim=-1).median(dim=1).values
+            deviation[chunk] = (moved[rows[chunk]] - middle).norm(dim=-1)
         usual = deviation[valid[rows]].median() if bool(valid[rows].any()) else deviation.new_zeros(())
         scale = _TOLERANCE * torch.maximum(spread, usual.clamp(min=max(noise, 1e-9)))
         trust[rows] = 1 / (1 + (deviation / scale).square()).square()

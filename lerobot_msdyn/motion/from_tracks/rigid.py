@@ -56,11 +56,11 @@ def refine(
     points, _ = model_points(xyz, weights, fit)
     usable = (weights * (fit.support > 0)[:, None]).transpose(1, 2)
     robust = _robust_weights(residuals(xyz, points, fit).transpose(1, 2), usable, _floor(xyz, weights)[:, None])
-    points, known = model_points(xyz, robust.transpose(1, 2), fit)
+    points, seen = model_points(xyz, robust.transpose(1, 2), fit)
 
     source = points[:, None].expand(-1, xyz.shape[1], -1, -1)
     target = xyz.transpose(0, 1).expand(len(weights), -1, -1, -1)
-    offered = weights.transpose(1, 2) * known[:, None]
+    offered = weights.transpose(1, 2) * seen[:, None]
     # frames without a motion yet take part with plain weights: new members may now support them
     start = torch.where((fit.support > 0)[..., None], robust, offered)
     motions = weighted_procrustes(source, target, start)
@@ -125,8 +125,8 @@ def _sweep(
             motions[rows, at] = last[rows]
             support[rows, at] = torch.where(accepted, effective.clamp(min=1e-6), 0.0)
             new = (seen > 0) & accepted[:, None]
-            share = (new / (count[rows] + 1))[..., None]
-            model[rows] += share * (transform_points(invert_se3(last[rows]), target) - model[rows])
+            rate = (new / (count[rows] + 1))[..., None]
+            model[rows] += rate * (transform_points(invert_se3(last[rows]), target) - model[rows])
             count[rows] = (count[rows] + new).clamp(max=_MODEL_MEMORY)
     return RigidFit(motions, support)
 

@@ -142,9 +142,9 @@ def level_affines(level: MotionLevel, times: Float[Tensor, " b"] | Int[Tensor, "
     after = torch.searchsorted(level.knots, times).clamp(max=len(level.knots) - 1)
     before = (after - 1).clamp(min=0)
     gap = (level.knots[after] - level.knots[before]).clamp(min=1e-9)
-    share = ((times - level.knots[before]) / gap).clamp(0, 1)[:, None]
-    rotations = rotation_6d_to_matrix(torch.lerp(level.rotations_6d[:, before], level.rotations_6d[:, after], share))
-    displacements = torch.lerp(level.displacements[:, before], level.displacements[:, after], share)
+    fraction = ((times - level.knots[before]) / gap).clamp(0, 1)[:, None]
+    rotations = rotation_6d_to_matrix(torch.lerp(level.rotations_6d[:, before], level.rotations_6d[:, after], fraction))
+    displacements = torch.lerp(level.displacements[:, before], level.displacements[:, after], fraction)
     rotated = (rotations @ level.pivots[:, None, :, None])[..., 0]
     affines = torch.cat((rotations, (level.pivots[:, None] + displacements - rotated)[..., None]), dim=-1)
     still = torch.eye(3, 4, dtype=affines.dtype, device=affines.device)

@@ -69,8 +69,8 @@ class SceneMotion:
             tracks = (self.instance == label).nonzero()[:, 0]
             if len(tracks) == 0:
                 tracks = torch.arange(len(self.points))
-            for some in rows.split(_CHUNK):
-                part[some], nearest[some] = self._vote(points[some], tracked[tracks], tracks)
+            for chunk in rows.split(_CHUNK):
+                part[chunk], nearest[chunk] = self._vote(points[chunk], tracked[tracks], tracks)
         back = quaternion_to_matrix(turned).transpose(1, 2)[nearest]
         x = self.points[nearest] + (back @ (points - tracked[nearest])[..., None])[..., 0]
         for _ in range(0 if self.is_rigid else _INVERSIONS):

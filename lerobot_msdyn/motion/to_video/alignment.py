@@ -68,28 +68,28 @@ def read_video(
     pixel_m: float,
 ) -> Video:
     """The maps of a video: depth in m (0 = unknown), instances (0 = what stands still)."""
-    known, outside = np.zeros(depth.shape, bool), np.zeros(depth.shape, np.uint8)
+    reliable, outside = np.zeros(depth.shape, bool), np.zeros(depth.shape, np.uint8)
     grey = np.zeros(depth.shape, np.uint8)
     window = np.ones((2 * REACH_PX + 1,) * 2, np.uint8)
     for t, (picture, z, labels) in enumerate(zip(rgb.numpy(), depth.numpy(), instances.numpy(), strict=True)):
-        known[t] = (cv2.erode((z > 0).astype(np.uint8), window) > 0) & ~near_depth_edge(z)
+        reliable[t] = (cv2.erode((z > 0).astype(np.uint8), window) > 0) & ~near_depth_edge(z)
         grey[t] = cv2.GaussianBlur(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (0, 0), 1.0)
         distance = cv2.distanceTransform((labels == 0).astype(np.uint8), cv2.DIST_L2, 5)
         outside[t] = (
             np.minimum(distance, 255 / OUTSIDE_UNIT) * OUTSIDE_UNIT
         )  # without any label the distance is infinite
-    maps = Maps(depth.numpy(), known, grey, outside, camera.intrinsics.float().contiguous().numpy(), pixel_m)
+    maps = Maps(depth.numpy(), reliable, grey, outside, camera.intrinsics.float().contiguous().numpy(), pixel_m)
     return Video(maps, instances, camera)
 
 
 def sight(video: Video, frames: list[int], most: int) -> Sightings:
     """Points of some frames, `most` of each, inside the masks and where depth and normals can be relied on."""
     window = np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8)
-    found = [(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), *torch.zeros(2, 0, dtype=torch.long))]
+    gathered = [(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), *torch.zeros(2, 0, dtype=torch.long))]
     for t in frames:
         labels = video.instances[t]
         inner = cv2.erode((labels > 0).numpy().astype(np.uint8), window) > 0
-        rows = np.argwhere(inner & video.maps.known[t])
+        rows = np.argwhere(inner & video.maps.reliable[t])
         rows = rows[evenly(len(rows), most).numpy()]
         row, column = torch.from_numpy(rows).unbind(-1)
         depth = torch.from_numpy(video.maps.depth[t])
@@ -97,8 +97,8 @@ def sight(video: Video, frames: list[int], most: int) -> Sightings:
         normals = _normals(depth, row, column, video.camera.intrinsics[t]) @ pose[:3, :3].T
         xyz = transform_points(pose, _in_camera(depth, row, column, video.camera.intrinsics[t]))
         grey = torch.from_numpy(video.maps.grey[t])[row, column].float()
-        found.append((xyz, normals, grey, torch.full_like(row, t), labels[row, column].long()))
-    return Sightings(*(torch.cat(each) for each in zip(*found, strict=True)))
+        gathered.append((xyz, normals, grey, torch.full_like(row, t), labels[row, column].long()))
+    return Sightings(*(torch.cat(each) for each in zip(*gathered, strict=True)))
 
 
 def align(
@@ -126,11 +126,11 @@ def align(
     )
     view = video.camera.camera_from_world.double()
     poses = (view @ motions).contiguous().numpy()
-    drawn = (view @ held).contiguous().numpy()
+    held_poses = (view @ held).contiguous().numpy()
     pixel_m = video.pixel_m
     align_poses(
         poses,
-        drawn,
+        held_poses,
         1 / (_TRACKS_SIGMA_PX * pixel_m) ** 2,
         pivots.numpy(),
         reach.numpy(),

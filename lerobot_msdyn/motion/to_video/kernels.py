@@ -40,7 +40,7 @@ class Maps(NamedTuple):
     """What t frames show."""
 
     depth: np.ndarray  # [t,h,w] m, float32
-    known: np.ndarray  # [t,h,w] bool, where depth and normals can be relied on
+    reliable: np.ndarray  # [t,h,w] bool, where depth and normals can be relied on
     grey: np.ndarray  # [t,h,w] uint8
     outside: np.ndarray  # [t,h,w] uint8, distance from the nearest moving pixel in eighths of a px
     intrinsics: np.ndarray  # [t,3,3] float32, px
@@ -120,7 +120,7 @@ def _compare(maps, t, x, y, z, nx, ny, nz, out):
     if outside > 0:
         seen = recorded == 0 or z < recorded + IN_FRONT_PX * maps.pixel_m
         return STRAY if seen and outside < OUTLINE_PX * OUTSIDE_UNIT else NOTHING
-    if not maps.known[t, row, column]:
+    if not maps.reliable[t, row, column]:
         return NOTHING
     sx, sy, sz, mx, my, mz = _surface(maps, t, row, column)
     if z < recorded - BEHIND_PX * maps.pixel_m:
@@ -144,15 +144,15 @@ def frame_costs(points, normals, grey, frames, maps):
         for i in range(points.shape[1]):
             x, y, z = points[f, i]
             nx, ny, nz = normals[f, i]
-            found = _compare(maps, t, x, y, z, nx, ny, nz, out)
-            if found == NOTHING:
+            outcome = _compare(maps, t, x, y, z, nx, ny, nz, out)
+            if outcome == NOTHING:
                 continue
             row, column = int(out[0]), int(out[1])
-            if found == MET:
+            if outcome == MET:
                 gx, gy = _slopes(maps.grey, t, row, column)
                 colour = (maps.grey[t, row, column] + gx * out[6] + gy * out[7] - grey[i]) / SIGMAS[1]
                 square = (out[2] / (SIGMAS[0] * maps.pixel_m)) ** 2 + colour**2
-            elif found == STRAY:
+            elif outcome == STRAY:
                 square = (maps.outside[t, row, column] / (OUTSIDE_UNIT * SIGMAS[2])) ** 2 + OUTLIER**2
             else:
                 square = 1e6
@@ -261,12 +261,12 @@ def _look(points, first, last, pose, maps, t, status, terms):
 
 
 @_inlined
-def _add_point(hessian, slope, found, term, mean, pivot, unit, maps, t):
-    """The residuals of one point, by what `_look` found."""
+def _add_point(hessian, slope, outcome, term, mean, pivot, unit, maps, t):
+    """The residuals of one point, by the `outcome` of its comparison."""
     k = maps.intrinsics[t]
     x, y, z = term[8], term[9], term[10]
     arm = (x - pivot[0], y - pivot[1], z - pivot[2])
-    if found == MET:
+    if outcome == MET:
         sigma = SIGMAS[0] * maps.pixel_m
         residual = term[2] / sigma
         weight = 1 / (1 + (residual / OUTLIER) ** 2) ** 2 / CORRELATED
@@ -302,7 +302,7 @@ def _add_hold(hessian, slope, hold, pose, held, middle, unit):
 def align_poses(poses, held, hold, pivots, reach, points, maps, steps, longest):
     """Gauss-Newton steps of poses (camera from canonical) [k,t,4,4], float64, in place.
 
-    Each is drawn to the pose in `held` (the same shape) with the weight `hold` (1/m^2, of a turn times the part's
+    Each is pulled to the pose in `held` (the same shape) with the weight `hold` (1/m^2, of a turn times the part's
     `reach` and of the shift of its pivot). Steps are `longest` (m) at most.
     """
     status, terms = np.zeros(len(points.xyz), np.int64), np.zeros((len(points.xyz), 12))

@@ -57,8 +57,8 @@ class Recording:
         """
         if len(self.points) == 0:
             return motion
-        found = regroup(self.video, self.points, self._start(motion), config.max_parts)
-        new = _with_parts(motion, found, self.points, frames_per_knot(motion.names[0], config))
+        grouping = regroup(self.video, self.points, self._start(motion), config.max_parts)
+        new = _with_parts(motion, grouping, self.points, frames_per_knot(motion.names[0], config))
         return new if self.costs(new)[0].mean() < self.costs(motion)[0].mean() else motion
 
     def approval(self, motion: SceneMotion, name: str) -> Callable[[MotionLevel], Bool[Tensor, " k"]]:
@@ -110,13 +110,13 @@ def _traced(motion: SceneMotion, seen: Sightings) -> tuple[Float[Tensor, "n 3"],
     return points, part
 
 
-def _with_parts(motion: SceneMotion, found: Grouping, seen: Sightings, knot_step: int) -> SceneMotion:
+def _with_parts(motion: SceneMotion, grouping: Grouping, seen: Sightings, knot_step: int) -> SceneMotion:
     """The motion by other parts, which are the identity at the canonical frame."""
-    at_canonical = found.motions[:, motion.canonical_frame]
-    motions = found.motions @ invert_se3(at_canonical)[:, None]
-    points = seen.at_canonical(motions, found.part)[0].float()
-    pivots = centres(points, found.part, len(motions))[0]
+    at_canonical = grouping.motions[:, motion.canonical_frame]
+    motions = grouping.motions @ invert_se3(at_canonical)[:, None]
+    points = seen.at_canonical(motions, grouping.part)[0].float()
+    pivots = centres(points, grouping.part, len(motions))[0]
     level = level_from_motions(
-        motions.float(), pivots, active=found.active, frames_per_knot=knot_step, canonical=motion.canonical_frame
+        motions.float(), pivots, active=grouping.active, frames_per_knot=knot_step, canonical=motion.canonical_frame
     )
-    return replace(motion, levels=(level,), points=points, part=found.part, instance=seen.instance)
+    return replace(motion, levels=(level,), points=points, part=grouping.part, instance=seen.instance)

@@ -10,7 +10,7 @@ from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.motion.to_video.alignment import Sightings, Video, align, carried_costs
 
 _JUDGED_FRAMES = 24  # in which points are compared with the video
-_NEIGHBOURS = 8  # that share in the choice of a point's part, ...
+_NEIGHBOURS = 8  # that take part in the choice of a point's part, ...
 _SPREADS = 2  # ... so many times in a row
 _SPLITS = 2  # times that every part is tried as two
 _LEAST_POINTS = 40  # of a part
@@ -39,21 +39,23 @@ def regroup(video: Video, points: Sightings, start: Grouping, max_parts: int) ->
     first, while that costs little or an instance has more than `max_parts`.
     """
     neighbours = _neighbours(points)
-    found = aligned(video, points, aligned(video, points, start))
+    grouping = aligned(video, points, aligned(video, points, start))
     for _ in range(_SPLITS):
-        found = aligned(video, points, _halved(points, found))
+        grouping = aligned(video, points, _halved(points, grouping))
         for _ in range(2):
-            found = aligned(video, points, _chosen(_costs(video, points, found, neighbours), found))
-        found = aligned(video, points, _pruned(_costs(video, points, found, neighbours), points, found, max_parts))
+            grouping = aligned(video, points, _chosen(_costs(video, points, grouping, neighbours), grouping))
+        grouping = aligned(
+            video, points, _pruned(_costs(video, points, grouping, neighbours), points, grouping, max_parts)
+        )
     for _ in range(2):
-        found = aligned(video, points, _chosen(_costs(video, points, found, neighbours), found))
-    return _chosen(_costs(video, points, found, neighbours), found)
+        grouping = aligned(video, points, _chosen(_costs(video, points, grouping, neighbours), grouping))
+    return _chosen(_costs(video, points, grouping, neighbours), grouping)
 
 
-def aligned(video: Video, points: Sightings, found: Grouping) -> Grouping:
+def aligned(video: Video, points: Sightings, grouping: Grouping) -> Grouping:
     """Moving parts after some steps towards what the video shows, loosely held by their motions from tracks."""
-    motions = align(video, points, found.part, found.motions, found.tracked)
-    return replace(found, motions=torch.where(found.active[:, None, None, None], motions, found.motions))
+    motions = align(video, points, grouping.part, grouping.motions, grouping.tracked)
+    return replace(grouping, motions=torch.where(grouping.active[:, None, None, None], motions, grouping.motions))
 
 
 def _neighbours(points: Sightings) -> Int[Tensor, "n j"]:
@@ -68,51 +70,51 @@ def _neighbours(points: Sightings) -> Int[Tensor, "n j"]:
     return near
 
 
-def _costs(video: Video, points: Sightings, found: Grouping, neighbours: Int[Tensor, "n j"]) -> Float[Tensor, "n k"]:
+def _costs(video: Video, points: Sightings, grouping: Grouping, neighbours: Int[Tensor, "n j"]) -> Float[Tensor, "n k"]:
     """Cost of each point in each part, smoothed over its neighbours; infinite in parts of other instances."""
     frames = evenly(len(video), _JUDGED_FRAMES)
-    costs = carried_costs(video, points, found.motions, frames)
+    costs = carried_costs(video, points, grouping.motions, frames)
     for _ in range(_SPREADS):
         costs = (costs + costs[neighbours].mean(1)) / 2
-    own = found.instance == points.instance[:, None]
-    return torch.where(own | ~own.any(1, keepdim=True), costs, torch.inf)
+    same_instance = grouping.instance == points.instance[:, None]
+    return torch.where(same_instance | ~same_instance.any(1, keepdim=True), costs, torch.inf)
 
 
-def _chosen(costs: Float[Tensor, "n k"], found: Grouping) -> Grouping:
+def _chosen(costs: Float[Tensor, "n k"], grouping: Grouping) -> Grouping:
     """Every point in the part that suits it best."""
-    return replace(found, part=costs.argmin(1))
+    return replace(grouping, part=costs.argmin(1))
 
 
-def _halved(points: Sightings, found: Grouping) -> Grouping:
+def _halved(points: Sightings, grouping: Grouping) -> Grouping:
     """Every moving part cut in two across its longest side, if there are enough points."""
-    at_canonical, _ = points.at_canonical(found.motions, found.part)
-    part, parents = found.part.clone(), list(range(len(found.motions)))
-    for k in range(len(found.motions)):
-        rows = (found.part == k).nonzero()[:, 0]
-        if not found.active[k] or len(rows) < 2 * _LEAST_POINTS:
+    at_canonical, _ = points.at_canonical(grouping.motions, grouping.part)
+    part, parents = grouping.part.clone(), list(range(len(grouping.motions)))
+    for k in range(len(grouping.motions)):
+        rows = (grouping.part == k).nonzero()[:, 0]
+        if not grouping.active[k] or len(rows) < 2 * _LEAST_POINTS:
             continue
         away = at_canonical[rows] - at_canonical[rows].mean(0)
         along = away @ torch.linalg.eigh(away.T @ away).eigenvectors[:, -1]
         part[rows[along > along.median()]] = len(parents)
         parents.append(k)
-    return replace(found.select(torch.tensor(parents)), part=part)
+    return replace(grouping.select(torch.tensor(parents)), part=part)
 
 
-def _pruned(costs: Float[Tensor, "n k"], points: Sightings, found: Grouping, max_parts: int) -> Grouping:
+def _pruned(costs: Float[Tensor, "n k"], points: Sightings, grouping: Grouping, max_parts: int) -> Grouping:
     """Without the parts that save too little; every instance keeps one at least, and `max_parts` at most."""
-    labels = int(max(points.instance.max(), found.instance.max())) + 1
-    of_instance = torch.bincount(points.instance, minlength=labels)[found.instance].clamp(min=1)
-    kept = torch.ones(len(found.motions), dtype=torch.bool)
+    labels = int(max(points.instance.max(), grouping.instance.max())) + 1
+    of_instance = torch.bincount(points.instance, minlength=labels)[grouping.instance].clamp(min=1)
+    kept = torch.ones(len(grouping.motions), dtype=torch.bool)
     while int(kept.sum()) > 1:
         best = torch.where(kept, costs, torch.inf).topk(2, dim=1, largest=False)
-        own = best.indices[:, 0]
+        chosen = best.indices[:, 0]
         loss = (best.values[:, 1] - best.values[:, 0]).nan_to_num(0.0, posinf=1.0)
-        saved = torch.zeros(len(kept)).to(loss).index_add_(0, own, loss) / of_instance
-        saved[torch.bincount(own, minlength=len(kept)) < _LEAST_POINTS] = 0
-        siblings = torch.bincount(found.instance[kept], minlength=labels)[found.instance]
+        saved = torch.zeros(len(kept)).to(loss).index_add_(0, chosen, loss) / of_instance
+        saved[torch.bincount(chosen, minlength=len(kept)) < _LEAST_POINTS] = 0
+        siblings = torch.bincount(grouping.instance[kept], minlength=labels)[grouping.instance]
         useless = kept & (siblings > 1) & ((saved < _WORTH) | (siblings > max_parts))
         if not bool(useless.any()):
             break
         kept[torch.where(useless, saved, torch.inf).argmin()] = False
     rows = kept.nonzero()[:, 0]
-    return replace(found.select(rows), part=costs[:, rows].argmin(1))
+    return replace(grouping.select(rows), part=costs[:, rows].argmin(1))
