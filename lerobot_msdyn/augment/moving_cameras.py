@@ -69,7 +69,7 @@ def why_moving(episode: Episode, key: str) -> str:
     camera that moves without the robot's doing (held in a hand) is not tied to the state.
     """
     rgb = episode.views[key].rgb
-    motion = camera_motion_px(rgb) * (320 / rgb.shape[2])
+    motion = camera_motion_px(rgb)
     if motion <= SWAY_PX:
         return ""
     if episode.state is None:

@@ -14,6 +14,7 @@ from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.core.fields import problems
 from lerobot_msdyn.core.geometry import transform_points
 from lerobot_msdyn.core.observations import PointTracks
+from lerobot_msdyn.core.sampling import scaled_px
 from lerobot_msdyn.motion.finer.add_level import Approve, add_level
 from lerobot_msdyn.motion.finer.residual import ResidualTracks, pull_back
 from lerobot_msdyn.motion.from_tracks.lift import LiftedTracks, lift_tracks, position_noise
@@ -59,7 +60,7 @@ def scene_motion(
         return None
     xyz, valid = xyz[kept], valid[kept]
     in_camera = transform_points(camera.camera_from_world, xyz.transpose(0, 1))[..., 2].T[valid]
-    pixel_m = float(in_camera.median() / camera.intrinsics[0, 0, 0])
+    pixel_m = scaled_px(float(in_camera.median() / camera.intrinsics[0, 0, 0]), camera.width)
     lifted = LiftedTracks(xyz, valid, tracks.confidence[kept], tracks.instance[kept], pixel_m)
     return motion_from_tracks(lifted, config, recording)
 

@@ -12,9 +12,10 @@ from torch import Tensor
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.geometry import nearest_pixel, transform_points, unproject
 from lerobot_msdyn.core.observations import PointTracks
+from lerobot_msdyn.core.sampling import scaled_px
 
 _EDGE_JUMP = 0.05  # relative difference of neighbouring depths that makes an edge
-_EDGE_MARGIN_PX = 2
+_EDGE_MARGIN_PX = 2  # of 320
 _DEPTH_WINDOW = 5  # frames over which a track's depth is smoothed
 _NORMAL_MAD = 1.4826  # standard deviations in the median absolute deviation of a normal distribution
 
@@ -27,7 +28,7 @@ class LiftedTracks:
     valid: Bool[Tensor, "n t"]
     confidence: Float[Tensor, "n t"]  # 0..1
     instance: Int[Tensor, " n"]
-    pixel_m: float  # size of a pixel where they are
+    pixel_m: float  # size of a pixel of a picture 320 wide, where they are
 
 
 def lift_tracks(
@@ -64,13 +65,14 @@ def position_noise(xyz: Float[Tensor, "n t 3"], valid: Bool[Tensor, "n t"]) -> f
 
 
 def near_depth_edge(depth: Float32[ndarray, "h w"], margin_px: int = _EDGE_MARGIN_PX) -> Bool[ndarray, "h w"]:
-    """Pixels within `margin_px` (at least 1) of a depth edge; unknown depth is no edge."""
+    """Pixels within `margin_px` (of a picture 320 wide; at least 1) of a depth edge; unknown depth is no edge."""
     measured = depth > 0
     window = np.ones((3, 3), np.uint8)
     far = cv2.dilate(np.where(measured, depth, 0).astype(np.float32), window)
     near = cv2.erode(np.where(measured, depth, np.inf).astype(np.float32), window)
     edge = (far / (1 + _EDGE_JUMP) > near).astype(np.uint8)
-    side = 2 * margin_px - 1  # the window above reaches one pixel already
+    reach = max(1, round(scaled_px(margin_px, depth.shape[1])))
+    side = 2 * reach - 1  # the window above reaches one pixel already
     return cv2.dilate(edge, np.ones((side, side), np.uint8)) > 0
 
 

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.geometry import invert_se3, transform_points, unproject
-from lerobot_msdyn.core.sampling import evenly
+from lerobot_msdyn.core.sampling import evenly, scaled_px, scaled_window
 from lerobot_msdyn.motion.from_tracks.lift import near_depth_edge
 from lerobot_msdyn.motion.to_video.kernels import OUTSIDE_UNIT, REACH_PX, Maps, Points, align_poses, frame_costs
 
-_BORDER_PX = 2  # of the masks, without points
+_BORDER_PX = 2  # of 320, of the masks, without points
 _STEPS = 2  # of Gauss-Newton
 _LONGEST_STEP_PX = 3.0
 _TRACKS_SIGMA_PX = 5.0  # error of motions that come from tracks
@@ -74,7 +74,7 @@ def read_video(
     for t, (picture, z, labels) in enumerate(zip(rgb.numpy(), depth.numpy(), instances.numpy(), strict=True)):
         reliable[t] = (cv2.erode((z > 0).astype(np.uint8), window) > 0) & ~near_depth_edge(z)
         grey[t] = cv2.GaussianBlur(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (0, 0), 1.0)
-        distance = cv2.distanceTransform((labels == 0).astype(np.uint8), cv2.DIST_L2, 5)
+        distance = cv2.distanceTransform((labels == 0).astype(np.uint8), cv2.DIST_L2, 5) / scaled_px(1, labels.shape[1])
         outside[t] = (
             np.minimum(distance, 255 / OUTSIDE_UNIT) * OUTSIDE_UNIT
         )  # without any label the distance is infinite
@@ -84,7 +84,7 @@ def read_video(
 
 def sight(video: Video, frames: list[int], most: int) -> Sightings:
     """Points of some frames, `most` of each, inside the masks and where depth and normals can be relied on."""
-    window = np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8)
+    window = scaled_window(_BORDER_PX, video.instances.shape[2])
     gathered = [(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), *torch.zeros(2, 0, dtype=torch.long))]
     for t in frames:
         labels = video.instances[t]

@@ -18,7 +18,7 @@ BEHIND_PX = 8.0  # a point farther than this from the recorded surface is hidden
 IN_FRONT_PX = 3.0  # a point no farther than this behind what stands still should have been seen
 FACING = 0.2  # least cosine between a normal and the view
 ALIKE = 0.5  # least cosine between the normals of a point and of the surface that it meets
-OUTLINE_PX = 8.0  # farther outside the masks a point tells nothing
+OUTLINE_PX = 8.0  # of 320: farther outside the masks a point tells nothing
 SIGMAS = (0.5, 8.0, 1.0)  # px of depth, grey levels, px outside the masks
 OUTLIER = 3.0  # sigmas at which three quarters of the weight are lost (Geman-McClure)
 CORRELATED = 8.0  # neighbouring points, which err alike and count as one
@@ -42,9 +42,9 @@ class Maps(NamedTuple):
     depth: np.ndarray  # [t,h,w] m, float32
     reliable: np.ndarray  # [t,h,w] bool, where depth and normals can be relied on
     grey: np.ndarray  # [t,h,w] uint8
-    outside: np.ndarray  # [t,h,w] uint8, distance from the nearest moving pixel in eighths of a px
+    outside: np.ndarray  # [t,h,w] uint8, distance from the nearest moving pixel, eighths of a px of 320
     intrinsics: np.ndarray  # [t,3,3] float32, px
-    pixel_m: float  # size of a pixel where things move
+    pixel_m: float  # size of a pixel of a picture 320 wide, where things move
 
 
 class Points(NamedTuple):

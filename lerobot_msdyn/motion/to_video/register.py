@@ -11,7 +11,7 @@ from torch import Tensor
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.config import MotionConfig
 from lerobot_msdyn.core.geometry import invert_se3, quaternion_to_matrix, se3, transform_points
-from lerobot_msdyn.core.sampling import evenly
+from lerobot_msdyn.core.sampling import evenly, scaled_px
 from lerobot_msdyn.motion.model.bases import MotionLevel, level_affines, level_from_motions
 from lerobot_msdyn.motion.model.scene_motion import SceneMotion
 from lerobot_msdyn.motion.spec import frames_per_knot
@@ -45,7 +45,8 @@ class Recording:
         seen = depth[(instances > 0) & (depth > 0)]
         if len(seen) == 0:
             return None
-        video = read_video(rgb, depth, instances, camera, float(seen.median() / camera.intrinsics[0, 0, 0]))
+        pixel_m = scaled_px(float(seen.median() / camera.intrinsics[0, 0, 0]), camera.width)
+        video = read_video(rgb, depth, instances, camera, pixel_m)
         spread = evenly(len(rgb), 2 * _MODEL_FRAMES - 1).tolist()
         return cls(video, sight(video, spread[::2], _POINTS), sight(video, spread[1::2], _JUDGES))
 

@@ -20,16 +20,17 @@ from torch import Tensor
 
 from lerobot_msdyn.core.images import box_about
 from lerobot_msdyn.core.observations import PointTracks
+from lerobot_msdyn.core.sampling import scaled_window
 from lerobot_msdyn.priors.tracks.patches import Patches, cut, register, sample
 
 PairFlow = Callable[[ndarray, ndarray], ndarray]
 
 _FEW_POINTS, _MANY_POINTS = 400, 1500  # per instance and frame; for fewer the grid is finer, for more coarser
-_EDGE_MARGIN_PX = 2  # of the first points of a track from the edge of their instance ...
-_SMALL_INSTANCE_PX = 1000  # ... and half of that in instances smaller than this
+_EDGE_MARGIN_PX = 2  # of 320, of the first points of a track from the edge of their instance ...
+_SMALL_INSTANCE = 0.013  # of the picture: ... and half of that in instances smaller than this
 _BACKGROUND_GREY = 128  # of what does not move, while flow is computed
 _LEAST_FLOW_PX = 64  # side of the part of a picture in which flow is computed
-_SMOOTH_WINDOW = 9  # px, over which an instance's flow is averaged for the second guess
+_SMOOTH_PX = 4  # of 320, to either side, over which an instance's flow is averaged for the second guess
 _STALE_NCC = 0.8  # below this the anchor no longer looks like the point: take a newer one ...
 _MIN_ANCHOR_AGE = 4  # ... unless it is younger than this, in frames
 _FOUND_NCC = 0.85  # an occluded point counts as seen again, at the place where it was lost, above this
@@ -211,8 +212,8 @@ def _new_points(labels: UInt8[ndarray, "h w"], followed: Float32[ndarray, "n 2"]
         mask = (labels == instance).astype(np.uint8)
         area = int(mask.sum())
         spacing = int(np.clip(math.sqrt(area / _FEW_POINTS), 2, max(grid, math.sqrt(area / _MANY_POINTS))))
-        margin = _EDGE_MARGIN_PX if area > _SMALL_INSTANCE_PX else 1
-        inside = cv2.erode(mask, _square(margin), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+        margin = scaled_window(_EDGE_MARGIN_PX if area > _SMALL_INSTANCE * mask.size else 1, width)
+        inside = cv2.erode(mask, margin, borderType=cv2.BORDER_CONSTANT, borderValue=0)
         covered = cv2.dilate(occupied, _square(spacing - 1))
         lattice = np.zeros_like(mask)
         lattice[spacing // 2 :: spacing, spacing // 2 :: spacing] = 1
@@ -279,7 +280,7 @@ def _guess(
 
 def _masked_mean(flow: Float32[ndarray, "h w 2"], mask: Bool[ndarray, "h w"]) -> Float32[ndarray, "h w 2"]:
     """Mean flow of the masked pixels in a window about every pixel."""
-    window = (_SMOOTH_WINDOW, _SMOOTH_WINDOW)
+    window = scaled_window(_SMOOTH_PX, mask.shape[1]).shape
     weight = cv2.blur(mask.astype(np.float32), window)
     return cv2.blur(flow * mask[..., None], window) / np.maximum(weight, 1e-6)[..., None]
 
