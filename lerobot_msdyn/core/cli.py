@@ -93,7 +93,7 @@ def _help_lines(config_class: type, prefix: str) -> Iterator[str]:
         if not dataclasses.is_dataclass(hint):
             kind = getattr(hint, "__name__", str(hint)) if isinstance(hint, type) else str(hint)
             kind = kind.replace("typing.", "").replace("pathlib.", "").replace("NoneType", "None")
-            yield f"  --{name} {kind} (default: {item.default})\n      {text}\n"
+            yield f"  --{name} {kind} (default: {_default(item)})\n      {text}\n"
         elif issubclass(typing.cast(Any, hint), draccus.ChoiceRegistry):
             for kind, choice in sorted(typing.cast(Any, hint).get_known_choices().items()):
                 yield f"\n--{name}.type {kind}: {inspect.getdoc(choice)}\n"
@@ -101,6 +101,10 @@ def _help_lines(config_class: type, prefix: str) -> Iterator[str]:
         else:
             yield f"\n{name}: {inspect.getdoc(typing.cast(type, hint))}\n"
             yield from _help_lines(typing.cast(type, hint), f"{name}.")
+
+
+def _default(item: dataclasses.Field) -> object:
+    return item.default if item.default_factory is dataclasses.MISSING else item.default_factory()
 
 
 def run_command(main: Callable[[list[str]], int], arguments: list[str] | None = None) -> None:

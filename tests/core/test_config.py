@@ -246,3 +246,9 @@ def test_help_answers_without_importing_torch() -> None:
 
 def test_the_balanced_recipe_holds_the_defaults() -> None:
     assert parse("--recipe", "balanced") == AugmentConfig()
+
+
+def test_the_help_shows_every_default() -> None:
+    text = format_help(AugmentConfig, {}, "augment")
+    assert "MISSING" not in text
+    assert "--fit.weights dict[str, float] (default: {'rgb': 1.0, 'depth': 0.1, 'mask': 0.1})" in text
