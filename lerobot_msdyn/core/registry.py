@@ -109,9 +109,7 @@ class Registry[T]:
         try:
             loaded = points[0].load() if points else importlib.import_module(places[0])
         except Exception as error:  # another package's import can fail in any way
-            raise ConfigError(
-                f"{self.kind} {name!r}: {places[0]} cannot be imported ({first_line(error)})"
-            ) from error
+            raise ConfigError(f"{self.kind} {name!r}: {places[0]} cannot be imported ({first_line(error)})") from error
         if name not in self._registered and not isinstance(loaded, ModuleType):
             self.add(name, loaded)
         if name not in self._registered:
