@@ -1,5 +1,7 @@
 """Bring masks, depth, tracks or cameras from a model of your own: an exchange file (docs/priors.md).
 
+Where it can run in this environment, a provider needs no files: 09_own_depth.py.
+
 python examples/04_own_prior.py [--frames 60] [--steps 500]
 """
 
@@ -23,9 +25,9 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=500, help="of the fit")
     arguments = parser.parse_args()
 
-    made_up = make_scene("push", 0, arguments.frames, 160, 120)
-    write_dataset([made_up], "local/desk", arguments.out / "desk")
-    truth = made_up.render(made_up.camera)  # stands for what your model says
+    synthetic = make_scene("push", 0, arguments.frames, 160, 120)
+    write_dataset([synthetic], "local/desk", arguments.out / "desk")
+    truth = synthetic.render(synthetic.camera)  # stands for what your model predicts
     file = arguments.out / "my_model.npz"
     content = Exchange(arguments.frames, 120, 160, episode=0, camera=CAMERA, depth=truth.depth.numpy())
     write_exchange(file, content)

@@ -13,8 +13,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lerobot_msdyn.augment import __main__ as augment
-from lerobot_msdyn.core.config import MOTION_LEVELS, MotionConfig
+from lerobot_msdyn.core.config import MotionConfig
 from lerobot_msdyn.core.fields import between
+from lerobot_msdyn.core.registries import MOTION_LEVELS
 from lerobot_msdyn.motion.finer.residual import ResidualTracks
 from lerobot_msdyn.motion.model.bases import MotionLevel
 from lerobot_msdyn.motion.model.binding import nearest_bases

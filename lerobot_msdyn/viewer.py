@@ -95,7 +95,7 @@ def show_episode(config: ViewerConfig, stream: "rr.RecordingStream") -> None:
         cameras = [key for key in cameras if key in saved]
         if not cameras:
             raise DatasetError(f"{config.scenes}: no saved scene of episode {index} of {source.repo_id}")
-    episode = read_episode(source, index, cameras, config.camera, recorded_depth=config.priors.depth != "plane")
+    episode = read_episode(source, index, cameras, config.camera, recorded_depth=config.priors.reads_recorded_depth)
     small = {key: view.shrunk(config.fit.max_width) for key, view in episode.views.items()}
     for key, view in episode.views.items():
         others = [other for name, other in small.items() if name != key]

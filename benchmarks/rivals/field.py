@@ -11,8 +11,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lerobot_msdyn.core.config import MOTION_LEVELS, MotionConfig
+from lerobot_msdyn.core.config import MotionConfig
 from lerobot_msdyn.core.geometry import quaternion_multiply
+from lerobot_msdyn.core.registries import MOTION_LEVELS
 from lerobot_msdyn.motion.spec import Binding, FirstLevel, PartTracks
 
 _POINT_OCTAVES = 6  # frequencies that encode a position ...

@@ -9,8 +9,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lerobot_msdyn.core.config import MOTION_LEVELS, MotionConfig
+from lerobot_msdyn.core.config import MotionConfig
 from lerobot_msdyn.core.fields import between
+from lerobot_msdyn.core.registries import MOTION_LEVELS
 from lerobot_msdyn.motion.finer.residual import ResidualTracks, cluster_places, smoothed_level, solve_residual
 from lerobot_msdyn.motion.from_tracks.clusters import direction_features, filled, k_means
 from lerobot_msdyn.motion.model.bases import COARSEST, MotionLevel

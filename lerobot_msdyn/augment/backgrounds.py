@@ -53,7 +53,9 @@ def shared_backgrounds(
     views: dict[str, dict[int, View]] = {key: {} for key in cameras}  # by episode
     for index in episodes:
         with contextlib.suppress(EpisodeError):
-            episode = read_episode(source, index, cameras, recipe.camera, recorded_depth=recipe.priors.depth != "plane")
+            episode = read_episode(
+                source, index, cameras, recipe.camera, recorded_depth=recipe.priors.reads_recorded_depth
+            )
             for key, view in episode.views.items():
                 views[key][index] = few_frames(view).shrunk(recipe.fit.max_width)
     found: dict[str, list[SharedBackground]] = {}

@@ -46,7 +46,7 @@ def measure_speeds(source: LeRobotDatasetMetadata, index: int, cameras: list[str
         PriorError: a prior was demanded and cannot be had.
     """
     start = time.perf_counter()
-    episode = read_episode(source, index, cameras, recipe.camera, recorded_depth=recipe.priors.depth != "plane")
+    episode = read_episode(source, index, cameras, recipe.camera, recorded_depth=recipe.priors.reads_recorded_depth)
     frames = len(episode.time)
     read_s = (time.perf_counter() - start) / frames
     short = replace(

@@ -51,7 +51,7 @@ def augment_episode(
         EpisodeError: the episode cannot be read.
         PriorError: a prior was demanded and cannot be had.
     """
-    episode = read_episode(source, index, cameras, recipe.camera, recorded_depth=recipe.priors.depth != "plane")
+    episode = read_episode(source, index, cameras, recipe.camera, recorded_depth=recipe.priors.reads_recorded_depth)
     kept = output.episode(index)
     scenes = {}
     for key, view in episode.views.items():

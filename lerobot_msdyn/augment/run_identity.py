@@ -18,6 +18,8 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.files import DIGEST_BYTES, digest_of_file
+from lerobot_msdyn.core.plugins import plugin_digests
+from lerobot_msdyn.core.registry import extending_packages
 from lerobot_msdyn.dataset.checks import place_problem
 from lerobot_msdyn.render.devices import chosen_device
 
@@ -26,7 +28,7 @@ PLACES = ("root", "new_root", "dry_run", "restart", "workers")  # settings that 
 
 
 def describe_run(root: Path, files: Iterable[Path], config: AugmentConfig) -> dict[str, Any]:
-    """Settings, digests of all files that are read, the device and versions, as JSON.
+    """Settings, digests of all files that are read and of the plugins, the device and versions, as JSON.
 
     Args:
         root: the folder of the source.
@@ -43,7 +45,8 @@ def describe_run(root: Path, files: Iterable[Path], config: AugmentConfig) -> di
         "device": chosen_device(config.device).type,
         "source": {str(path.relative_to(root)): digest_of_file(path) for path in files},
         "files": {str(path): digest_of_file(path) for path in _named_files(settings)},
-        "versions": versions() | {"code": code_digest()},
+        "plugins": plugin_digests(),
+        "versions": versions() | extending_packages() | {"code": code_digest()},
     }
 
 

@@ -21,8 +21,10 @@ from functools import cached_property
 from multiprocessing.connection import Connection
 from multiprocessing.queues import Queue
 from pathlib import Path
+from typing import Any
 
 import cv2
+import draccus
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
 from tqdm import tqdm
@@ -31,6 +33,7 @@ from lerobot_msdyn.augment.backgrounds import Backgrounds, MaskTask, Run, shared
 from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.augment.episode import Progress
 from lerobot_msdyn.core.errors import WorkerError
+from lerobot_msdyn.core.plugins import import_plugins, imported_plugins
 from lerobot_msdyn.dataset.read import open_source
 from lerobot_msdyn.dataset.staging import Staging
 from lerobot_msdyn.dataset.video import quiet_encoders
@@ -66,14 +69,30 @@ class Work:
 
 @dataclass(frozen=True)
 class _Place:
-    """Where a worker finds what its parent works on."""
+    """Where a worker finds what its parent works on.
 
+    Plain values only: what is sent is read before any plugin is imported, from which the settings' types may be.
+    """
+
+    plugins: list[str]
     repo_id: str
     root: Path
     cameras: list[str]
-    config: AugmentConfig
+    settings: dict[str, Any]
     new_repo_id: str
     new_root: Path
+
+
+def _place_of(work: Work) -> _Place:
+    source, output = work.source, work.output
+    settings = draccus.encode(work.config)
+    return _Place(imported_plugins(), source.repo_id, source.root, work.cameras, settings, output.repo_id, output.root)
+
+
+def _config_at(place: _Place) -> AugmentConfig:
+    import_plugins(place.plugins)
+    config: AugmentConfig = draccus.decode(AugmentConfig, place.settings)
+    return config
 
 
 def workers_for(config: AugmentConfig, frames: int, episodes: int) -> int:
@@ -119,15 +138,12 @@ class Workers:
 
     def __init__(self, count: int, work: Work) -> None:
         self.count = count
-        place = _Place(
-            work.source.repo_id, work.source.root, work.cameras, work.config, work.output.repo_id, work.output.root
-        )
         context = multiprocessing.get_context("spawn")
         theirs, self._ours = context.Pipe(duplex=False)
         self._said: Queue = context.Queue()
         self._listener = threading.Thread(target=_listen, args=(self._said, work.progress), daemon=True)
         threads = _share_of_threads(count)
-        self._pool = ProcessPoolExecutor(count, context, _begin, (place, threads, theirs, self._said))
+        self._pool = ProcessPoolExecutor(count, context, _begin, (_place_of(work), threads, theirs, self._said))
 
     def __enter__(self) -> "Workers":
         self._listener.start()
@@ -191,10 +207,10 @@ def _begin(place: _Place, threads: int, parent: Connection, said: Queue) -> None
     torch.set_num_threads(threads)
     cv2.setNumThreads(threads)
     quiet_encoders()
-    source = open_source(place.repo_id, place.root)
+    config, source = _config_at(place), open_source(place.repo_id, place.root)
     staging = Staging(place.new_root, lock=False)
-    output = OutputDataset(source, place.new_repo_id, place.new_root, staging, nvenc=place.config.nvenc)
-    _here.append(Work(source, place.cameras, place.config, output, lambda what, share: said.put((what, share))))
+    output = OutputDataset(source, place.new_repo_id, place.new_root, staging, nvenc=config.nvenc)
+    _here.append(Work(source, place.cameras, config, output, lambda what, share: said.put((what, share))))
 
 
 def _end_with(parent: Connection) -> None:

@@ -11,15 +11,14 @@ from typing import Any, Literal
 import draccus
 
 from lerobot_msdyn.core.errors import ConfigError, one_line
-from lerobot_msdyn.core.fields import INFINITY, MAX_SEED, between, numbers_of, one_of, problems
+from lerobot_msdyn.core.fields import AUTO, FILE, INFINITY, MAX_SEED, between, numbers_of, one_of, problems
 from lerobot_msdyn.core.perturbation import Perturbation
-from lerobot_msdyn.core.registries import LOSSES
+from lerobot_msdyn.core.registries import CAMERAS, DEPTH, LOSSES, MASKS, MOTION_LEVELS, TRACKS
 from lerobot_msdyn.core.registry import Registry
 
 # Named: draccus finds the comment above a field only where its annotation holds no quotes.
 Device = Literal["auto", "cpu", "cuda"]
 Fill = Literal["inpaint", "nearest", "none"]
-MOTION_LEVELS: Registry[Any] = Registry("motion level", "lerobot_msdyn.motion.levels")
 _LEVELS = ["object", "primitive", "grain"]
 # Motion levels of other systems, which are not the package's own -> the plugin that registers each.
 RIVAL_LEVELS = {"flat": "benchmarks/rivals/flat.py", "field": "benchmarks/rivals/field.py"}
@@ -32,7 +31,7 @@ class CameraConfig:
     # JSON file with K (and R, t) of each camera, see docs/calibration.md; without it the camera is taken as fixed.
     calibration: Path | None = None
     # auto (the calibration, else fixed), fixed, sfm (pycolmap, for a moving camera), or an .npz file with K and w2c.
-    poses: str = one_of("auto", ("auto", "fixed", "sfm"))
+    poses: str = one_of(AUTO, (AUTO,), registry=CAMERAS)
     # Horizontal field of view in degrees, used where no calibration names the camera.
     horizontal_fov_deg: float = between(60.0, 5, 170)
     # Look for the field of view at which rigid things keep their size; needs depth other than the plane's.
@@ -42,18 +41,23 @@ class CameraConfig:
     # Downward tilt of the camera in degrees, used where no depth is recorded.
     tilt_deg: float = between(35.0, 1, 90)
 
+    @property
+    def needs_whole_videos(self) -> bool:
+        """Whether the poses are found for a whole video: it cannot be fitted part by part."""
+        return _needs_whole_videos(self.poses, CAMERAS)
+
 
 @dataclass
 class PriorsConfig:
-    """What is known about a video before the fit."""
+    """What is known about a video before the fit: each by a provider (docs/priors.md), yours too (--plugins)."""
 
     # auto (recorded, else a learned model that is on this machine, else stereo, else plane), recorded, plane,
     # depth_anything, depth_anything_metric, stereo (two or more calibrated cameras), or an .npz file.
-    depth: str = one_of("auto", ("auto", "recorded", "plane", "depth_anything", "depth_anything_metric", "stereo"))
+    depth: str = one_of(AUTO, (AUTO,), registry=DEPTH)
     # auto (a learned model that is on this machine, else change), change, sam2, edgetam, or an .npz file.
-    masks: str = one_of("auto", ("auto", "change", "sam2", "edgetam"))
+    masks: str = one_of(AUTO, (AUTO,), registry=MASKS)
     # auto (raft if its weights are on this machine, else flow), flow, raft, or an .npz file.
-    tracks: str = one_of("auto", ("auto", "flow", "raft"))
+    tracks: str = one_of(AUTO, (AUTO,), registry=TRACKS)
     # Model of `depth_anything`: an id on the Hugging Face hub or a folder.
     depth_anything_model: str = "depth-anything/Depth-Anything-V2-Small-hf"
     # Model of `depth_anything_metric`: an id on the hub or a folder.
@@ -66,6 +70,17 @@ class PriorsConfig:
     raft_weights: Path | None = None
     # Where computed priors are kept: auto (LEROBOT_MSDYN_CACHE, else ~/.cache/lerobot_msdyn), off, or a folder.
     cache: str = "auto"
+
+    @property
+    def needs_whole_videos(self) -> bool:
+        """Whether one of them is found for a whole video: it cannot be fitted part by part."""
+        chosen = ((self.depth, DEPTH), (self.masks, MASKS), (self.tracks, TRACKS))
+        return any(_needs_whole_videos(name, registry) for name, registry in chosen)
+
+    @property
+    def reads_recorded_depth(self) -> bool:
+        """Whether recorded depth can be of use, so that its videos have to be decoded."""
+        return self.depth not in DEPTH or bool(DEPTH.get(self.depth).reads_recorded_depth)
 
 
 @dataclass
@@ -271,5 +286,8 @@ class Recipe:
     @property
     def needs_whole_videos(self) -> bool:
         """Whether a prior is for a whole video: exchange files, and the poses of a moving camera."""
-        sources = (self.priors.depth, self.priors.masks, self.priors.tracks, self.camera.poses)
-        return self.camera.poses == "sfm" or any(source.endswith(".npz") for source in sources)
+        return self.priors.needs_whole_videos or self.camera.needs_whole_videos
+
+
+def _needs_whole_videos(name: str, registry: Registry) -> bool:
+    return name.endswith(FILE) or (name in registry and bool(registry.get(name).needs_whole_videos))

@@ -8,6 +8,7 @@ from lerobot_msdyn.core.registry import Registry
 Number = int | float
 
 INFINITY = float("inf")
+AUTO = "auto"  # the best of what can be used
 FILE = ".npz"  # ending of an exchange file
 MAX_INDEX = 1_000_000_000  # of an episode
 MAX_SEED = 4_294_967_295

@@ -1,6 +1,6 @@
 """What one camera recorded, and what its priors say of it: depth, instances, point tracks and the camera itself."""
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -13,12 +13,12 @@ from lerobot_msdyn.core.cameras import CameraTrack
 
 @dataclass(frozen=True)
 class DepthTraits:
-    """What can be relied on in depth, as its provider says."""
+    """What can be relied on in depth, as its provider states it."""
 
     metric: bool = False  # in true metres (a sensor or a calibration), not only plausible
-    sharp: bool = False  # edges stand where those of the picture do, and frames agree with each other
-    relative_error: float = 0.05  # that cannot be seen in the video
-    assumed: bool = False  # nobody has looked: it contradicts no picture
+    sharp: bool = False  # edges stand where those of the image do, and frames agree with each other
+    relative_error: int | float = 0.05  # share of the depth by which it may be off without the video showing it
+    assumed: bool = False  # nothing was measured: it is no evidence against any image
 
     @property
     def measured(self) -> bool:
@@ -27,24 +27,34 @@ class DepthTraits:
 
 
 @dataclass(frozen=True)
+class Model:
+    """A learned model, as the log and files name it; what is not known is empty."""
+
+    name: str = ""
+    revision: str = ""
+    licence: str = ""
+
+
+@dataclass(frozen=True)
 class Origin:
     """Which provider a prior comes from, and why that one."""
 
     provider: str
     why: str
-    model: str = ""  # empty where nothing learned is involved
-    revision: str = ""
-    licence: str = ""
+    model: Model | None = None  # None where nothing learned is involved
 
     @property
     def line(self) -> str:
         """For the log."""
-        model = f" ({self.model}, revision {self.revision}, {self.licence})" if self.model else ""
+        model = f" ({self.model.name}, revision {self.model.revision}, {self.model.licence})" if self.model else ""
         return f"{self.provider}{model}: {self.why}"
 
     def entry(self) -> dict[str, str]:
-        """For files: what is known, by name."""
-        return {name: value for name, value in asdict(self).items() if value}
+        """For files: provider, why, model, revision and licence, as far as they are known."""
+        model = Model() if self.model is None else self.model
+        named = {"model": model.name, "revision": model.revision, "licence": model.licence}
+        stated = {"provider": self.provider, "why": self.why, **named}
+        return {name: value for name, value in stated.items() if value}
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,7 @@ PUBLISHED = "published.json"
 WORTH_KEEPING = (SCENE, "variant", FINISHED)  # what takes long to make
 MAX_NAMED = 5  # differences that a message lists
 CODE_CHANGED = "the code of lerobot_msdyn has changed"
+FILES = ("source", "files", "plugins")  # parts of the description whose values are digests of files
 
 
 def work_folder(root: Path) -> Path:
@@ -220,14 +221,14 @@ def differences(before: Any, now: Any, name: str = "") -> list[str]:
     if isinstance(before, dict) and isinstance(now, dict):
         lines = []
         for key in sorted({*before, *now}):
-            inner = f"{name}: {key}" if name == "source" else f"{name}.{key}".removeprefix(".").removeprefix("recipe.")
+            inner = f"{name}: {key}" if name in FILES else f"{name}.{key}".removeprefix(".").removeprefix("recipe.")
             lines += differences(before.get(key), now.get(key), inner)
         return lines
     if before == now:
         return []
     if name == "versions.code":  # a digest, which says nothing to a reader
         return [CODE_CHANGED]
-    if name.startswith("source: "):
+    if name.partition(": ")[0] in FILES:
         state = "is new" if before is None else "is gone" if now in (None, "absent") else "has changed"
         return [f"{name} {state}"]
     return [f"{name} was {before}, is {now}"]

@@ -11,8 +11,9 @@ from typing import Any, ClassVar
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lerobot_msdyn.core.config import MOTION_LEVELS, MotionConfig
+from lerobot_msdyn.core.config import MotionConfig
 from lerobot_msdyn.core.errors import ConfigError
+from lerobot_msdyn.core.registries import MOTION_LEVELS
 from lerobot_msdyn.core.serialise import allow
 from lerobot_msdyn.motion.finer.residual import ResidualTracks
 from lerobot_msdyn.motion.model.bases import MotionLevel

@@ -58,7 +58,7 @@ def run(arguments: list[str]) -> int:
     failures = []
     for index in episodes:
         try:
-            recorded = config.priors.depth != "plane"
+            recorded = config.priors.reads_recorded_depth
             one_episode(read_episode(source, index, cameras, config.camera, recorded_depth=recorded), config)
         except EpisodeError as error:
             logger.error("skipped: %s", error)

@@ -2,9 +2,9 @@
 
     FOLDER/<digest of the video's pixels>/<prior>-<provider>-<digest of the settings>.npz
 
-The pixels stand for dataset, episode and camera. The settings include everything that the result depends on, and the
-code of this package's priors, so that results of older code are never found. Files appear by one rename. Nothing is
-ever deleted: remove the folder at any time to get the disk space back.
+The pixels stand for dataset, episode and camera. The settings include everything that the result depends on, the code
+of this package's priors, and the file of a provider from elsewhere, so that results of older code are never taken.
+Files appear by one rename. Nothing is ever deleted: remove the folder at any time to get the disk space back.
 """
 
 import functools
@@ -12,6 +12,7 @@ import hashlib
 import json
 import logging
 import os
+import sys
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -22,6 +23,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 from torch import Tensor
+
+from lerobot_msdyn.core.files import digest_of_file
 
 logger = logging.getLogger(__name__)
 
@@ -42,17 +45,21 @@ class PriorCache:
         """The arrays of an earlier run with these settings, else those that `compute` returns, which are then kept.
 
         Where the folder cannot be written nothing is kept, and a warning says so.
+
+        Args:
+            prior: masks, depth or tracks.
+            provider: its name.
+            settings: what the result depends on besides the video and the code, as JSON.
+            compute: makes the arrays; the file that defines it counts as the provider's code.
         """
         if self.folder is None:
             return compute()
-        content = json.dumps(
-            {"settings": settings, "code": code_digest(Path(__file__).parent)}, sort_keys=True, default=str
-        )
+        content = json.dumps({"settings": settings, "code": _code_of(compute)}, sort_keys=True, default=str)
         path = self.folder / f"{prior}-{provider}-{_digest(content.encode())}.npz"
-        found = _read(path)
-        if found is not None:
+        kept = _read(path)
+        if kept is not None:
             logger.info("%s: taken from %s", prior, path)
-            return found
+            return kept
         arrays = compute()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -111,6 +118,15 @@ def save_npz(path: Path, arrays: Arrays) -> None:
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def _code_of(compute: Callable[[], Arrays]) -> str:
+    """Changes whenever this package's priors do, or the file of a provider from elsewhere."""
+    package = Path(__file__).parent
+    file = getattr(sys.modules.get(compute.__module__), "__file__", None)
+    if file is None or Path(file).is_relative_to(package):
+        return code_digest(package)
+    return code_digest(package) + digest_of_file(Path(file))
 
 
 @functools.cache

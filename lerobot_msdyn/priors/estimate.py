@@ -2,19 +2,20 @@
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 
 from jaxtyping import UInt8
 from torch import Tensor
 
-from lerobot_msdyn.core.config import CameraConfig, PriorsConfig
-from lerobot_msdyn.core.observations import Priors, View
+from lerobot_msdyn.core.config import CameraConfig, Device, PriorsConfig
+from lerobot_msdyn.core.observations import Origin, Priors, View
 from lerobot_msdyn.priors.cache import open_cache
-from lerobot_msdyn.priors.camera.provide import provide_camera, with_searched_fov
-from lerobot_msdyn.priors.depth.provide import provide_depth
-from lerobot_msdyn.priors.hub import torch_device
-from lerobot_msdyn.priors.masks.provide import provide_masks
+from lerobot_msdyn.priors.camera.field_of_view import with_searched_fov
+from lerobot_msdyn.priors.from_file import CameraFile, DepthFile, MaskFile, TrackFile
+from lerobot_msdyn.priors.provide import provide
+from lerobot_msdyn.priors.registry import CameraProvider, DepthProvider, MaskProvider, Masks, TrackProvider
 from lerobot_msdyn.priors.request import Request
-from lerobot_msdyn.priors.tracks.provide import provide_tracks
+from lerobot_msdyn.render.devices import chosen_device
 
 logger = logging.getLogger(__name__)
 
@@ -28,7 +29,7 @@ def estimate_priors(
     elsewhere: UInt8[Tensor, "m h w 3"] | None = None,
     episode: int | None = None,
     key: str | None = None,
-    device: str = "auto",
+    device: Device = "auto",
 ) -> Priors:
     """Run the providers that the recipe asks for on one camera's video.
 
@@ -43,23 +44,29 @@ def estimate_priors(
         device: auto, cpu or cuda, for learned providers.
 
     Raises:
+        ConfigError: there is no such provider, or the device cannot be used.
         PriorError: a provider was asked for by name and cannot be had, or an exchange file cannot be used.
     """
-    cache = open_cache(config.cache, view.rgb)
-    request = Request(view, config, camera, cache, others, elsewhere, episode, key, torch_device(device))
-    instances, masks_from = provide_masks(request)
-    request, camera_from = provide_camera(request, instances)
-    (depth, traits), depth_from = provide_depth(request, instances)
-    tracks, tracks_from = provide_tracks(request, instances)
-    pinhole = request.view.camera
+    request = _request(view, config, camera, elsewhere, episode, key, device, others)
+    instances, masks_from = _masks(request)
+    pinhole, camera_from = provide(
+        CameraProvider, camera.poses, request, lambda provider: provider.estimate(request, instances), file=CameraFile
+    )
+    posed = replace(request, view=replace(view, camera=pinhole))
+    depth, depth_from = provide(
+        DepthProvider, config.depth, posed, lambda provider: provider.estimate(posed, instances), file=DepthFile
+    )
+    tracks, tracks_from = provide(
+        TrackProvider, config.tracks, posed, lambda provider: provider.estimate(posed, instances), file=TrackFile
+    )
     if camera.fov_search:
-        pinhole, camera_from = with_searched_fov(pinhole, tracks, depth, traits)
+        pinhole, camera_from = with_searched_fov(pinhole, tracks, depth)
     origins = {"camera": camera_from, "masks": masks_from, "depth": depth_from, "tracks": tracks_from}
-    found = {"masks": f", {int(instances.max())} instances", "tracks": f", {len(tracks)} tracks"}
+    counts = {"masks": f", {int(instances.max())} instances", "tracks": f", {len(tracks)} tracks"}
     for prior, origin in origins.items():
-        logger.info("%s: %s%s", prior, origin.line, found.get(prior, ""))
+        logger.info("%s: %s%s", prior, origin.line, counts.get(prior, ""))
     provenance = {prior: origin.entry() for prior, origin in origins.items()}
-    return Priors(depth, instances, tracks, traits, provenance, pinhole)
+    return Priors(depth.z, instances, tracks, depth.traits, provenance, pinhole)
 
 
 def estimate_masks(
@@ -70,8 +77,28 @@ def estimate_masks(
     elsewhere: UInt8[Tensor, "m h w 3"] | None = None,
     episode: int | None = None,
     key: str | None = None,
-    device: str = "auto",
+    device: Device = "auto",
 ) -> UInt8[Tensor, "t h w"]:
     """The masks of `estimate_priors` alone (0 = nothing moves), which finds them in the cache afterwards."""
+    return _masks(_request(view, config, camera, elsewhere, episode, key, device))[0]
+
+
+def _masks(request: Request) -> tuple[Masks, Origin]:
+    return provide(
+        MaskProvider, request.config.masks, request, lambda provider: provider.estimate(request), file=MaskFile
+    )
+
+
+def _request(
+    view: View,
+    config: PriorsConfig,
+    camera: CameraConfig,
+    elsewhere: UInt8[Tensor, "m h w 3"] | None,
+    episode: int | None,
+    key: str | None,
+    device: Device,
+    others: Sequence[View] = (),
+) -> Request:
+    network_device = chosen_device(device, networks=True).type
     cache = open_cache(config.cache, view.rgb)
-    return provide_masks(Request(view, config, camera, cache, (), elsewhere, episode, key, torch_device(device)))[0]
+    return Request(view, config, camera, cache, others, elsewhere, episode, key, network_device)

@@ -16,11 +16,12 @@ from jaxtyping import Bool, Float32, Int, Shaped, UInt8
 from numpy import ndarray
 
 from lerobot_msdyn.core.errors import PriorError, first_line
-from lerobot_msdyn.core.observations import Priors, View
+from lerobot_msdyn.core.observations import Model, Priors, View
 from lerobot_msdyn.priors.cache import save_npz
 
-DEPTH_KINDS = ("metric", "scale", "affine_disparity")
+DEPTH_KINDS = METRIC, SCALE, AFFINE_DISPARITY = "metric", "scale", "affine_disparity"
 MAX_INSTANCE = 255
+_MODEL = {"name": "model", "revision": "revision", "licence": "licence"}  # field of Model -> key of the provenance
 _ASPECT = 0.01  # relative difference of the aspect ratio that rounding to whole pixels explains
 
 
@@ -44,6 +45,13 @@ class Exchange:
     K: Float32[ndarray, "t 3 3"] | None = None  # px
     w2c: Float32[ndarray, "t 4 4"] | None = None  # camera from world, m
     provenance: dict[str, Any] = field(default_factory=dict)
+
+    def model(self, prior: str) -> Model | None:
+        """The learned model that a prior comes from, as far as the file states it."""
+        entry = self.provenance.get(prior)
+        stated = entry if isinstance(entry, dict) else {}
+        named = {name: str(stated[key]) for name, key in _MODEL.items() if key in stated}
+        return Model(**named) if named else None
 
 
 def from_priors(view: View, priors: Priors, episode: int, camera: str) -> Exchange:
@@ -163,18 +171,18 @@ def _check_origin(path: Path, arrays: dict[str, ndarray], frames: int, episode: 
 
 def _size_of(path: Path, arrays: dict[str, ndarray], height: int, width: int) -> tuple[int, int]:
     """Height and width of the file's images."""
-    found = next((arrays[name].shape[1:] for name in ("masks", "depth") if name in arrays), None)
+    size = next((arrays[name].shape[1:] for name in ("masks", "depth") if name in arrays), None)
     if "size" in arrays:
-        found = tuple(int(value) for value in arrays["size"].reshape(-1))
-    if found is None and not {"tracks", "K"} & set(arrays):
+        size = tuple(int(value) for value in arrays["size"].reshape(-1))
+    if size is None and not {"tracks", "K"} & set(arrays):
         return height, width
-    if found is None or len(found) != 2 or min(found) < 1:
+    if size is None or len(size) != 2 or min(size) < 1:
         raise PriorError(f"{path}: does not say of which size its images are; add size = [height, width] in pixels")
-    if abs(found[1] / found[0] * height / width - 1) > _ASPECT + 1 / min(*found, height, width):
+    if abs(size[1] / size[0] * height / width - 1) > _ASPECT + 1 / min(*size, height, width):
         raise PriorError(
-            f"{path}: is of {found[1]}x{found[0]} pixels, the video of {width}x{height}: of another camera, or cropped?"
+            f"{path}: is of {size[1]}x{size[0]} pixels, the video of {width}x{height}: of another camera, or cropped?"
         )
-    return found[0], found[1]
+    return size[0], size[1]
 
 
 def _check_shapes(path: Path, arrays: dict[str, ndarray], frames: int, size: tuple[int, int]) -> None:

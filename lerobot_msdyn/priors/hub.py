@@ -4,11 +4,10 @@ import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
 from huggingface_hub import constants, try_to_load_from_cache
 
-from lerobot_msdyn.core.errors import PriorError
-from lerobot_msdyn.core.observations import Origin
+from lerobot_msdyn.core.observations import Model
+from lerobot_msdyn.priors.registry import Unusable
 
 UNKNOWN_LICENCE = "unknown: read its model card"
 NON_COMMERCIAL = "CC-BY-NC-4.0"
@@ -26,90 +25,64 @@ LICENCES = {
     "depth-anything/Depth-Anything-V2-Metric-Indoor-Base-hf": NON_COMMERCIAL,
     "depth-anything/Depth-Anything-V2-Metric-Indoor-Large-hf": NON_COMMERCIAL,
 }
-# transformers builds the default configuration of EdgeTAM when it loads one, and reads this model's for it.
-COMPANIONS = {"edgetam": "timm/repvit_m1.dist_in1k"}
 
 
 @dataclass(frozen=True)
-class LocalModel:
-    """A model that can be loaded without a network."""
+class LocalModel(Model):
+    """A model that can be loaded without a network.
 
-    name: str  # id on the hub, or the folder that was given
-    folder: Path
-    revision: str  # commit on the hub; "local" for a folder
-    licence: str
+    Its name is its id on the hub or the folder that was given, its revision a commit on the hub, "local" of a folder.
+    """
 
-
-def learned_origin(provider: str, model: LocalModel, why: str) -> Origin:
-    """The origin of what a learned model predicted."""
-    return Origin(provider, why, model.name, model.revision, model.licence)
+    folder: Path = Path()  # of a single file of weights: that file
 
 
-def find_model(name: str) -> LocalModel | None:
-    """The model of an id in the local Hugging Face cache, or in a folder of that name; None if it is in neither."""
-    licence = LICENCES.get(name, UNKNOWN_LICENCE)
+def find_model(name: str, licence: str = UNKNOWN_LICENCE) -> LocalModel | None:
+    """The model of an id in the local Hugging Face cache, or in a folder of that name; None if it is in neither.
+
+    Args:
+        name: the id or the folder.
+        licence: that of a model which `LICENCES` does not list.
+    """
+    licence = LICENCES.get(name, licence)
     folder = Path(name).expanduser()
     if _is_complete(folder):
-        return LocalModel(name, folder, "local", licence)
+        return LocalModel(name, "local", licence, folder)
     if name.count("/") != 1 or folder.is_absolute():
         return None
-    config = try_to_load_from_cache(name, "config.json", cache_dir=constants.HF_HUB_CACHE)
-    if not isinstance(config, str) or not _is_complete(Path(config).parent):
+    config = _cached_config(name)
+    if config is None or not _is_complete(config.parent):
         return None
-    return LocalModel(name, Path(config).parent, Path(config).parent.name, licence)
+    return LocalModel(name, config.parent.name, licence, config.parent)
 
 
-def has_companion(provider: str) -> bool:
-    """Whether the configuration that a provider needs besides its model is in the local cache."""
-    name = COMPANIONS.get(provider)
-    return name is None or isinstance(
-        try_to_load_from_cache(name, "config.json", cache_dir=constants.HF_HUB_CACHE), str
-    )
+def local_model(name: str, licence: str = UNKNOWN_LICENCE, *, companion: str = "") -> LocalModel:
+    """The same, which must be there.
 
-
-def _is_complete(folder: Path) -> bool:
-    return (folder / "config.json").is_file() and any(folder.glob("*.safetensors"))
-
-
-def demand_model(name: str, field: str, provider: str) -> LocalModel:
-    """The model, which was asked for by name.
+    Args:
+        name: the id or the folder.
+        licence: that of a model which `LICENCES` does not list.
+        companion: id of a model whose configuration transformers reads as it loads this one.
 
     Raises:
-        PriorError: it, or the library that runs it, is not on this machine.
+        Unusable: it, or the library that runs it, is not on this machine.
     """
-    demand_library("transformers", "priors", field, provider)
-    model = find_model(name)
+    demand_library("transformers", "priors", f"the model {name}")
+    model = find_model(name, licence)
     if model is None:
-        raise PriorError(
-            f"{field} is {provider!r}, but the model {name} is not on this machine; fetch it with: hf download {name}"
-        )
-    if not has_companion(provider):
-        companion = COMPANIONS[provider]
-        raise PriorError(
-            f"{field} is {provider!r}, which needs the configuration of {companion} as well; "
-            f"fetch it with: hf download {companion} config.json"
+        raise Unusable(f"the model {name} is not on this machine", f"fetch it with: hf download {name}")
+    if companion and _cached_config(companion) is None:
+        raise Unusable(
+            f"the model {name} needs the configuration of {companion} as well",
+            f"fetch it with: hf download {companion} config.json",
         )
     return model
 
 
-def demand_library(module: str, extra: str, field: str, provider: str) -> None:
-    """Raise a PriorError if an optional library is not installed."""
+def demand_library(module: str, extra: str, user: str) -> None:
+    """Raise `Unusable` if an optional library is not installed which `user` needs."""
     if not has_library(module):
-        raise PriorError(
-            f"{field} is {provider!r}, which needs {module}; install it with: pip install 'lerobot_msdyn[{extra}]'"
-        )
-
-
-def torch_device(name: str) -> str:
-    """The device that `auto`, `cpu` or `cuda` stands for.
-
-    Raises:
-        PriorError: there is no CUDA device.
-    """
-    available = torch.cuda.is_available()
-    if name == "cuda" and not available:
-        raise PriorError("device is 'cuda', but no CUDA device is there; use --device auto or cpu")
-    return "cuda" if available and name != "cpu" else "cpu"
+        raise Unusable(f"{user} needs {module}", f"install it with: pip install 'lerobot_msdyn[{extra}]'")
 
 
 def has_library(module: str) -> bool:
@@ -118,3 +91,13 @@ def has_library(module: str) -> bool:
         return importlib.util.find_spec(module) is not None
     except ValueError:  # a module without a spec, or None in sys.modules
         return False
+
+
+def _is_complete(folder: Path) -> bool:
+    return (folder / "config.json").is_file() and any(folder.glob("*.safetensors"))
+
+
+def _cached_config(name: str) -> Path | None:
+    """The configuration of a model in the local Hugging Face cache."""
+    path = try_to_load_from_cache(name, "config.json", cache_dir=constants.HF_HUB_CACHE)
+    return Path(path) if isinstance(path, str) else None

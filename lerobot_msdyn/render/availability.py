@@ -25,12 +25,20 @@ def has_cuda_device() -> bool:
     return torch.cuda.is_available()
 
 
-def _missing() -> str:
-    """What is absent, as far as that can be told without compiling anything."""
+def no_device_problem() -> str:
+    """Why torch cannot use a GPU, and what to do about it; empty if it can."""
     if torch.version.cuda is None:
         return "this torch was built without CUDA; install one with it (https://pytorch.org/get-started/locally)"
     if not has_cuda_device():
         return "torch sees no CUDA device; look at nvidia-smi, the driver and CUDA_VISIBLE_DEVICES"
+    return ""
+
+
+def _missing() -> str:
+    """What is absent, as far as that can be told without compiling anything."""
+    problem = no_device_problem()
+    if problem:
+        return problem
     if importlib.util.find_spec("gsplat") is None:
         return "gsplat is not installed; install it with: pip install 'lerobot_msdyn[cuda]'"
     if importlib.util.find_spec("gsplat.csrc") is not None:  # a wheel with kernels

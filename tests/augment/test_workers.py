@@ -1,18 +1,30 @@
 """Several processes make the same dataset as one, and end with the process that started them."""
 
 import filecmp
+import json
 import os
+import pickle
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import pyarrow.parquet as pq
 import pytest
 
 from lerobot_msdyn.augment import __main__ as augment
+from lerobot_msdyn.augment import run, workers
 from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.augment.workers import workers_for
+from lerobot_msdyn.core import plugins
+from lerobot_msdyn.core.cli import EXIT_INTERRUPTED, parse_config
+from lerobot_msdyn.core.errors import OutputError
+from lerobot_msdyn.core.registries import DEPTH
+from lerobot_msdyn.dataset.read import open_source
+from lerobot_msdyn.dataset.write import OutputDataset
 
 FAST = (
     "--fit.steps",
@@ -67,6 +79,84 @@ def test_two_workers_make_the_same_dataset(desk: Path, tmp_path: Path, caplog: p
     _, different, failed = filecmp.cmpfiles(tmp_path / "1", tmp_path / "2", one, shallow=False)
     assert (different, failed) == ([], [])
     assert any(record.getMessage().startswith("overlay:") for record in caplog.records)  # said by a worker
+
+
+PLUGIN = """
+import torch
+from lerobot_msdyn.core.observations import DepthTraits
+from lerobot_msdyn.priors.registry import DEPTH, Depth, DepthProvider, Estimate
+
+@DEPTH.register("far_wall")
+class FarWall(DepthProvider):
+    reads_recorded_depth = False
+
+    def estimate(self, request, instances):
+        return Estimate(Depth(torch.full(instances.shape, METRES), DepthTraits(sharp=True)))
+"""
+
+
+@pytest.fixture
+def plugin(tmp_path: Path) -> Iterator[Path]:
+    """A depth provider of a user's own, in a file named like one of Python's modules."""
+    path = tmp_path / "random.py"
+    path.write_text(PLUGIN.replace("METRES", "1.5"))
+    yield path
+    DEPTH._registered.pop("far_wall", None)
+    plugins._imported.pop(str(path), None)
+
+
+def forgotten(plugin: Path) -> None:
+    """The plugin is imported anew, as by another run."""
+    DEPTH._registered.pop("far_wall")
+    plugins._imported.pop(str(plugin))
+
+
+def test_workers_use_a_plugin_of_the_run(desk: Path, tmp_path: Path, plugin: Path) -> None:
+    flags = ("--plugins", str(plugin), "--priors.depth", "far_wall", "--workers", "2", "--episodes", "[0,1]")
+    assert augment.run(command(desk, tmp_path / "new", *flags)) == 0
+    rows = pq.read_table(tmp_path / "new" / "meta" / "msdyn" / "episodes.parquet").to_pylist()
+    made = [json.loads(row["priors"]) for row in rows if row["variant"] >= 0]
+    assert [priors["observation.images.front"]["depth"]["provider"] for priors in made] == ["far_wall"] * 2
+
+
+def test_settings_reach_a_worker_as_plain_values(desk: Path, tmp_path: Path, plugin: Path) -> None:
+    """They may be of a plugin's types, which cannot be read before the plugin is imported."""
+    plugin.write_text(
+        "from dataclasses import dataclass\nfrom lerobot_msdyn.core.config import PerturbationConfig\n"
+        "@PerturbationConfig.register_subclass('shove')\n@dataclass\nclass Shove(PerturbationConfig):\n"
+        "    metres: float = 0.5\n"
+    )
+    flags = command(desk, tmp_path / "new", "--plugins", str(plugin), "--perturbation.type", "shove")
+    config = parse_config(AugmentConfig, [*flags, "--perturbation.metres", "2"], augment.ALIASES, command="")
+    source = open_source("local/desk", desk)
+    work = workers.Work(
+        source, ["front"], config, OutputDataset(source, "local/new", tmp_path / "new"), lambda *_: None
+    )
+    sent = pickle.dumps(workers._place_of(work))
+    assert plugins.PREFIX.encode() not in sent
+    assert workers._config_at(pickle.loads(sent)) == config
+
+
+def test_a_run_goes_on_only_with_the_plugin_that_it_began_with(
+    desk: Path, tmp_path: Path, plugin: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = run.augment_episode
+
+    def stopped(source: Any, index: int, *rest: Any) -> object:
+        if index == 1:
+            raise KeyboardInterrupt
+        return whole(source, index, *rest)
+
+    monkeypatch.setattr(run, "augment_episode", stopped)
+    flags = ("--plugins", str(plugin), "--priors.depth", "far_wall", "--workers", "1", "--episodes", "[0,1]")
+    arguments = command(desk, tmp_path / "new", *flags)
+    assert augment.run(arguments) == EXIT_INTERRUPTED
+    forgotten(plugin)
+    assert augment.run(arguments) == EXIT_INTERRUPTED
+    forgotten(plugin)
+    plugin.write_text(PLUGIN.replace("METRES", "2.25"))
+    with pytest.raises(OutputError, match=r"started differently: plugins: .*random\.py has changed"):
+        augment.run(arguments)
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks for processes in /proc")

@@ -91,7 +91,7 @@ def test_an_entry_point_may_be_a_module_that_registers_itself(shapes: Registry, 
 def test_an_entry_point_that_fails_is_named_when_it_is_asked_for(shapes: Registry, tmp_path: Path) -> None:
     install(tmp_path, "circles", "1 / 0\n", "circle = circles:Circle")
     assert shapes.get("square").__name__ == "Square"
-    with pytest.raises(ConfigError, match=r"shape 'circle': circles:Circle cannot be imported .ZeroDivisionError"):
+    with pytest.raises(ConfigError, match=r"shape 'circle': circles:Circle cannot be imported \(ZeroDivisionError"):
         shapes.get("circle")
 
 
@@ -122,7 +122,7 @@ def test_a_module_that_is_run_again_registers_again(shapes: Registry) -> None:
 
 
 def test_names_are_those_that_a_recipe_can_hold(shapes: Registry) -> None:
-    with pytest.raises(ConfigError, match=r"shape 'my.npz': expected a name of letters, digits and underscores"):
+    with pytest.raises(ConfigError, match=r"shape 'my\.npz': expected a name of letters, digits and underscores"):
         shapes.add("my.npz", int)
 
 

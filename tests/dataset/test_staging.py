@@ -108,7 +108,9 @@ def test_stopped_right_after_the_dataset_was_moved(tmp_path: Path) -> None:
 def test_differences_by_name() -> None:
     before = {"recipe": {"cameras": None}, "source": {"a": "1", "b": "2"}, "versions": {"torch": "1"}}
     now = {"recipe": {"cameras": ["x"]}, "source": {"b": "absent", "c": "3"}, "versions": {"torch": "2"}}
+    before, now = before | {"plugins": {"/x/mine.py": "1"}}, now | {"plugins": {"/x/mine.py": "2"}}
     assert differences(before, now) == [
+        "plugins: /x/mine.py has changed",
         "cameras was None, is ['x']",
         "source: a is gone",
         "source: b is gone",

@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 
 from lerobot_msdyn.augment import __main__ as augment
-from lerobot_msdyn.core.config import MOTION_LEVELS, MotionConfig
+from lerobot_msdyn.core.config import MotionConfig
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.core.fields import problems
+from lerobot_msdyn.core.registries import MOTION_LEVELS
 from lerobot_msdyn.motion.estimate import motion_from_tracks
 from lerobot_msdyn.motion.from_tracks.clusters import spread_nodes
 from lerobot_msdyn.motion.from_tracks.lift import LiftedTracks

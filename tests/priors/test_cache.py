@@ -1,12 +1,14 @@
 """Kept results: found again, apart for other settings, whole or not at all."""
 
 import logging
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from lerobot_msdyn.core.plugins import _from_file
 from lerobot_msdyn.priors import cache as cache_module
 from lerobot_msdyn.priors.cache import PriorCache, default_folder, open_cache, save_npz
 
@@ -46,6 +48,16 @@ def test_results_of_other_code_are_not_found(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(cache_module, "code_digest", lambda folder: "newer")
     cache.get("depth", "plane", {}, compute)
     assert compute.calls == 2
+
+
+def test_results_of_another_provider_s_older_code_are_not_found(tmp_path: Path) -> None:
+    cache, path = open_cache(str(tmp_path / "cache"), RGB), tmp_path / "mine.py"
+    for number in (1, 1, 10):  # another length: modules are compiled anew by size and time
+        path.write_text(f"import numpy as np\ndef compute():\n    return {{'x': np.full(1, {number})}}\n")
+        module = _from_file(path)
+        assert cache.get("depth", "mine", {}, module.compute)["x"] == [number]
+    del sys.modules[module.__name__]
+    assert len(list((tmp_path / "cache").rglob("*.npz"))) == 2
 
 
 @pytest.mark.parametrize("damage", ["cut", "flipped", "empty"])
@@ -89,6 +101,6 @@ def test_a_file_appears_whole_or_not_at_all(tmp_path: Path) -> None:
 
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "file").write_text("")
-    found = PriorCache(tmp_path / "file" / "x").get("depth", "plane", {}, Counter())
-    assert found["x"][0] == 1
+    arrays = PriorCache(tmp_path / "file" / "x").get("depth", "plane", {}, Counter())
+    assert arrays["x"][0] == 1
     assert "cannot be written" in caplog.text

@@ -64,8 +64,11 @@ def test_its_files_can_be_given_back(desk: Path, tmp_path: Path) -> None:
     [
         ([], "--repo is missing"),
         (["--repo", "local/desk"], "--out is missing"),
-        (["--priors.masks", "sam3"], "priors.masks is 'sam3'; expected auto, change, sam2, edgetam or a file FILE.npz"),
-        (["--priors.depth", "lidar"], "priors.depth is 'lidar'; expected auto, recorded, plane, depth_anything, "),
+        (["--priors.masks", "sam3"], "priors.masks is 'sam3'; expected auto, change, edgetam, sam2 or a file FILE.npz"),
+        (
+            ["--priors.depth", "lidar"],
+            "priors.depth is 'lidar'; expected auto, depth_anything, ",
+        ),
         (["--priors.tracks", "tapir"], "priors.tracks is 'tapir'; expected auto, flow, raft or a file FILE.npz"),
         (["--camera.poses", "slam"], "camera.poses is 'slam'; expected auto, fixed, sfm or a file FILE.npz"),
     ],

@@ -3,20 +3,19 @@
 from pathlib import Path
 
 import pytest
-import torch
 from huggingface_hub import constants
 
 from lerobot_msdyn.core.config import PriorsConfig
-from lerobot_msdyn.core.errors import PriorError
 from lerobot_msdyn.priors.hub import (
     LICENCES,
     NON_COMMERCIAL,
+    UNKNOWN_LICENCE,
     demand_library,
-    demand_model,
     find_model,
     has_library,
-    torch_device,
+    local_model,
 )
+from lerobot_msdyn.priors.registry import Unusable
 
 SAM2 = "facebook/sam2.1-hiera-tiny"
 
@@ -54,8 +53,23 @@ def test_a_model_without_weights_does_not_count(hub: Path) -> None:
 
 
 def test_a_missing_model_is_named_with_the_command_that_fetches_it(hub: Path) -> None:
-    with pytest.raises(PriorError, match=f"priors.masks is 'sam2'.*fetch it with: hf download {SAM2}$"):
-        demand_model(SAM2, "priors.masks", "sam2")
+    pytest.importorskip("transformers")
+    with pytest.raises(Unusable, match=f"the model {SAM2} is not on this machine; fetch it with: hf download {SAM2}$"):
+        local_model(SAM2)
+    put_in_cache(hub, SAM2)
+    assert local_model(SAM2).licence == "Apache-2.0"
+    with pytest.raises(Unusable, match=r"configuration of timm/x as well; fetch .*hf download timm/x config\.json"):
+        local_model(SAM2, companion="timm/x")
+    put_in_cache(hub, "timm/x", weights=False)
+    assert local_model(SAM2, companion="timm/x") == local_model(SAM2)
+
+
+def test_a_provider_states_the_licence_of_its_own_model(hub: Path) -> None:
+    put_in_cache(hub, "me/my_model")
+    for licence, stated in (("MIT", "MIT"), (UNKNOWN_LICENCE, "unknown: read its model card")):
+        model = find_model("me/my_model", licence)
+        assert model is not None
+        assert model.licence == stated
 
 
 @pytest.mark.parametrize("name", ["no such thing", "/absent/folder", "a/b/c", ""])
@@ -65,8 +79,8 @@ def test_names_that_cannot_be_ids_are_not_found(hub: Path, name: str) -> None:
 
 def test_a_missing_library_is_named_with_the_command_that_installs_it() -> None:
     assert has_library("torch")
-    with pytest.raises(PriorError, match=r"needs no_such_library; install it with: pip install 'lerobot_msdyn\[sfm\]'"):
-        demand_library("no_such_library", "sfm", "camera.poses", "sfm")
+    with pytest.raises(Unusable, match=r"it needs no_such_library; install .*: pip install 'lerobot_msdyn\[sfm\]'"):
+        demand_library("no_such_library", "sfm", "it")
 
 
 def test_no_default_is_restricted_to_non_commercial_use() -> None:
@@ -74,12 +88,3 @@ def test_no_default_is_restricted_to_non_commercial_use() -> None:
     defaults = [getattr(config, name) for name in vars(config) if name.endswith("_model")]
     assert len(defaults) == 4
     assert all(LICENCES[name] != NON_COMMERCIAL for name in defaults)
-
-
-def test_devices(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert [torch_device(name) for name in ("auto", "cpu")] == ["cpu", "cpu"]
-    with pytest.raises(PriorError, match="no CUDA device is there"):
-        torch_device("cuda")
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    assert [torch_device(name) for name in ("auto", "cpu", "cuda")] == ["cuda", "cpu", "cuda"]

@@ -13,7 +13,7 @@ from torchvision.models.optical_flow import Raft_Small_Weights, raft_small
 
 from lerobot_msdyn.core.errors import PriorError
 from lerobot_msdyn.priors.tracks.flow import flow_tracks
-from lerobot_msdyn.priors.tracks.raft import RaftFlow, demand_raft, find_raft
+from lerobot_msdyn.priors.tracks.raft import RaftFlow, raft_weights
 
 PAIR = np.random.default_rng(0).integers(0, 255, (2, 72, 100, 3)).astype(np.uint8)
 
@@ -27,7 +27,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_flow_has_the_size_of_the_pictures(weights: Path) -> None:
-    flow = RaftFlow(demand_raft(weights), "cpu")(*PAIR)
+    flow = RaftFlow(raft_weights(weights), "cpu")(*PAIR)
     assert flow.shape == (72, 100, 2)
     assert np.isfinite(flow).all()
 
@@ -36,24 +36,23 @@ def test_torchvision_s_own_file_is_found_and_read(
     weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    assert find_raft(None) is None
     with pytest.raises(PriorError, match=r"not on this machine; fetch: python -c .*raft_small.*C_T_V2"):
-        demand_raft(None)
+        raft_weights(None)
     path = tmp_path / "hub" / "checkpoints" / Path(Raft_Small_Weights.C_T_V2.url).name
     path.parent.mkdir(parents=True)
     torch.save(raft_small(weights=None).state_dict(), path)
-    model = demand_raft(None)
+    model = raft_weights(None)
     assert (model.revision, model.licence) == ("raft_small_C_T_V2-01064c6d", "BSD-3-Clause")
     RaftFlow(model, "cpu")
 
 
 def test_bad_weights_are_named(tmp_path: Path) -> None:
     with pytest.raises(PriorError, match=r"there is no .*absent\.pth"):
-        demand_raft(tmp_path / "absent.pth")
+        raft_weights(tmp_path / "absent.pth")
     other = tmp_path / "other.safetensors"
     save_file({"x": torch.zeros(1)}, other)
     with pytest.raises(PriorError, match="does not hold the weights of raft_small"):
-        RaftFlow(demand_raft(other), "cpu")
+        RaftFlow(raft_weights(other), "cpu")
 
 
 def test_the_tracker_uses_the_flow_that_it_is_given(sliding) -> None:

@@ -114,13 +114,29 @@ def test_auto_says_once_why_it_is_not_the_gpu(
     with caplog.at_level("INFO"):
         assert [devices.chosen_device("auto") for _ in range(2)] == [torch.device("cpu")] * 2
     said = [record for record in caplog.records if record.name == "lerobot_msdyn.render.devices"]
-    assert [(record.levelname, "fitting and drawing on the CPU" in record.getMessage()) for record in said] == [
+    assert [(record.levelname, "fitting and rendering on the CPU" in record.getMessage()) for record in said] == [
         (level, True)
     ]
     caplog.clear()
     assert devices.chosen_device("cpu") == torch.device("cpu")
     assert caplog.records == []
     devices._say_once.cache_clear()
+
+
+def test_networks_need_a_gpu_but_not_gsplat(machine: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    from lerobot_msdyn.render.devices import chosen_device
+
+    machine.setattr(availability.importlib.util, "find_spec", lambda name: None)
+    devices = [chosen_device(name, networks=True).type for name in ("auto", "cpu", "cuda")]
+    assert devices == ["cuda", "cpu", "cuda"]
+    with pytest.raises(ConfigError, match="device is 'cuda', but gsplat is not installed"):
+        chosen_device("cuda")
+    machine.setattr(torch.cuda, "is_available", lambda: False)
+    with caplog.at_level("INFO"):
+        assert [chosen_device(name, networks=True).type for name in ("auto", "cpu")] == ["cpu", "cpu"]
+    assert caplog.records == []
+    with pytest.raises(ConfigError, match=r"device is 'cuda', but torch sees no CUDA device.*or use --device cpu"):
+        chosen_device("cuda", networks=True)
 
 
 def test_auto_takes_the_gpu(machine: pytest.MonkeyPatch) -> None:

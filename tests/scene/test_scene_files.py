@@ -11,8 +11,8 @@ from jaxtyping import Float
 from safetensors.torch import save_file
 from torch import Tensor
 
-from lerobot_msdyn.core.config import MOTION_LEVELS
 from lerobot_msdyn.core.errors import MsdynError
+from lerobot_msdyn.core.registries import MOTION_LEVELS
 from lerobot_msdyn.core.serialise import load_value, save_value
 from lerobot_msdyn.motion.model.bases import MotionLevel
 from lerobot_msdyn.motion.spec import Binding, FirstLevel

@@ -162,7 +162,7 @@ def _json_cameras(root: Path, names: Sequence[str]) -> tuple[Float[ndarray, "n 3
 
 def _colmap_cameras(root: Path, names: Sequence[str]) -> tuple[Float[ndarray, "n 3 3"], Float[ndarray, "n 4 4"], float]:
     """Intrinsics (px at 1x) and world-from-camera (m) that Shape of Motion refined; metres per unit of its files."""
-    demand_library("pycolmap", "sfm", "protocol", "som")
+    demand_library("pycolmap", "sfm", "protocol 'som'")
     import pycolmap
 
     folder = root / PROCESSED / "colmap"

@@ -4,7 +4,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lerobot_msdyn.core.config import MOTION_LEVELS, MotionConfig
+from lerobot_msdyn.core.config import MotionConfig
+from lerobot_msdyn.core.registries import MOTION_LEVELS
 from lerobot_msdyn.motion.model.bases import MotionLevel
 from lerobot_msdyn.motion.spec import Binding, FirstLevel, PartTracks
 

@@ -3,7 +3,8 @@
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lerobot_msdyn.core.config import MOTION_LEVELS, MotionConfig
+from lerobot_msdyn.core.config import MotionConfig
+from lerobot_msdyn.core.registries import MOTION_LEVELS
 from lerobot_msdyn.motion.finer.residual import ResidualTracks
 from lerobot_msdyn.motion.from_tracks.clusters import spread_nodes
 from lerobot_msdyn.motion.model.bases import MotionLevel

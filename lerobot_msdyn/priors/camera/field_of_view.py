@@ -7,14 +7,16 @@ the one with the best correlation decides.
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int
 from numpy import ndarray
 
-from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.cameras import CameraTrack, intrinsics_from_fov
 from lerobot_msdyn.core.errors import PriorError
-from lerobot_msdyn.core.observations import PointTracks
+from lerobot_msdyn.core.observations import Origin, PointTracks
+from lerobot_msdyn.priors.registry import Depth
 
 _PAIRS = 4000
 _MIN_PAIRS = 50
@@ -22,6 +24,23 @@ _MIN_FRAMES = 10  # in which both points of a pair are seen
 _MIN_CORRELATION = 0.7
 _STEPS = 20
 _FOV_DEG = (20.0, 140.0)  # a result beyond is taken for a failure
+
+
+def with_searched_fov(camera: CameraTrack, tracks: PointTracks, depth: Depth) -> tuple[CameraTrack, Origin]:
+    """The camera with the field of view at which rigid things keep their size.
+
+    Raises:
+        PriorError: the depth is assumed, or nothing turns enough to tell.
+    """
+    if depth.traits.assumed:
+        raise PriorError(
+            "camera.fov_search needs depth that does not depend on the field of view: recorded, learned or from a file"
+        )
+    fov, correlation = fov_from_rigid_motion(tracks, depth.z.numpy(), camera)
+    intrinsics = camera.intrinsics.clone()
+    intrinsics[:, 0, 0] = intrinsics[:, 1, 1] = intrinsics_from_fov(camera.width, camera.height, fov)[0, 0]
+    why = f"rigid things keep their size at {fov:.1f} degrees (correlation {correlation:.2f})"
+    return replace(camera, intrinsics=intrinsics, origin="fov_search"), Origin("fov_search", why)
 
 
 def fov_from_rigid_motion(

@@ -19,6 +19,7 @@ from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.priors.camera.steadiness import FIXED_PX, camera_motion_px
 from lerobot_msdyn.priors.hub import demand_library
+from lerobot_msdyn.priors.registry import Unusable
 
 _MAX_FRAMES = 100  # that are registered; the others are interpolated
 _OVERLAP = 10  # neighbours of a frame with which it is matched
@@ -33,19 +34,19 @@ def camera_from_sfm(view: View, instances: UInt8[Tensor, "t h w"]) -> CameraTrac
     Raises:
         PriorError: pycolmap is absent, the camera does not move, or too few frames could be registered.
     """
-    demand_library("pycolmap", "sfm", "camera.poses", "sfm")
+    demand_library("pycolmap", "sfm", "structure from motion")
     motion = camera_motion_px(view.rgb, instances > 0)
     if motion < FIXED_PX:
-        raise PriorError(
-            f"camera.poses is 'sfm', but the camera does not move ({motion:.2f} px): there is no parallax to "
-            "reconstruct from; use --camera.poses auto"
+        raise Unusable(
+            f"the camera does not move ({motion:.2f} px): there is no parallax to reconstruct from",
+            "use --camera.poses auto",
         )
     frames = evenly(len(view), _MAX_FRAMES).numpy()
     with tempfile.TemporaryDirectory(prefix="lerobot_msdyn_sfm_") as name:
         folder = Path(name)
         _write_images(folder, view, instances, frames)
-        found = _reconstruct(folder, view.camera)
-    poses, intrinsics = found if found is not None else ({}, None)
+        model = _reconstruct(folder, view.camera)
+    poses, intrinsics = model if model is not None else ({}, None)
     if intrinsics is None or len(poses) < max(2, _MIN_SHARE * len(frames)):
         raise PriorError(
             f"structure from motion registered {len(poses)} of {len(frames)} frames; expected half of them or more: "

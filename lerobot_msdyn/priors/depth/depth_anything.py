@@ -1,19 +1,64 @@
-"""Depth of single pictures by Depth Anything V2 (Yang et al., NeurIPS 2024), through transformers."""
+"""Depth of single images by Depth Anything V2 (Yang et al., NeurIPS 2024), through transformers."""
 
-from typing import Any
+from abc import abstractmethod
+from dataclasses import replace
+from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from lerobot_msdyn.core.errors import PriorError
+from lerobot_msdyn.priors.depth.metres import in_metres
+from lerobot_msdyn.priors.exchange import AFFINE_DISPARITY, METRIC
 from lerobot_msdyn.priors.hub import LocalModel
+from lerobot_msdyn.priors.registry import Depth, DepthProvider, Estimate, Masks
+from lerobot_msdyn.priors.request import Request
 
-_BATCH = 4  # pictures
+_BATCH = 4  # images
+
+
+class DepthAnything(DepthProvider):
+    """Its models of one kind."""
+
+    kind: ClassVar[str]  # of what they predict, see `in_metres`
+
+    @abstractmethod
+    def model(self, request: Request) -> LocalModel:
+        """The model that the settings name.
+
+        Raises:
+            Unusable: it is not on this machine.
+        """
+
+    def usable(self, request: Request) -> str:
+        """The model is there."""
+        self.model(request)
+        return "its model is on this machine"
+
+    def estimate(self, request: Request, instances: Masks) -> Estimate[Depth]:
+        """Aligned to the best depth that needs no network, where it lacks true metres itself."""
+        model = self.model(request)
+
+        def compute() -> dict[str, np.ndarray]:
+            values, metric = predict_depth(request.view.rgb, model, request.device)
+            return {"values": values.numpy().astype(np.float16), "metric": np.array(metric)}
+
+        settings = {"model": model.name, "revision": model.revision}
+        arrays = request.cache.get("depth", "depth_anything", settings, compute)
+        kind = METRIC if bool(arrays["metric"]) else AFFINE_DISPARITY
+        if kind != self.kind:
+            raise PriorError(
+                f"{model.name} predicts {kind.replace('_', ' ')}; expected a model of {self.kind.replace('_', ' ')}"
+            )
+        values = torch.from_numpy(arrays["values"].astype(np.float32))
+        estimate = in_metres(request, instances, values, kind, trusted=False)
+        return replace(estimate, model=model)
 
 
 def predict_depth(rgb: UInt8[Tensor, "t h w 3"], model: LocalModel, device: str) -> tuple[Float[Tensor, "t h w"], bool]:
-    """What the network says of every frame, and whether that is metric.
+    """What the network predicts of every frame, and whether that is metric.
 
     Metric: z-depth in metres of a camera like those of the network's training, so its scale is that of an unknown
     focal length. Relative: inverse depth up to a scale and a shift, larger = nearer.
@@ -29,8 +74,8 @@ def predict_depth(rgb: UInt8[Tensor, "t h w 3"], model: LocalModel, device: str)
         inputs = processor(images=[frame.numpy() for frame in part.cpu()], return_tensors="pt").to(device)
         with torch.inference_mode():
             outputs = network(**inputs)
-        found = processor.post_process_depth_estimation(outputs, target_sizes=[size] * len(part))
-        frames += [item["predicted_depth"].float().cpu() for item in found]
+        sized = processor.post_process_depth_estimation(outputs, target_sizes=[size] * len(part))
+        frames += [item["predicted_depth"].float().cpu() for item in sized]
     depth = torch.stack(frames)
     metric = network.config.depth_estimation_type == "metric"
     return (depth.clamp(min=0) if metric else depth), metric

@@ -10,7 +10,8 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from lerobot_msdyn.core.errors import PriorError
-from lerobot_msdyn.priors.hub import LocalModel, demand_library, has_library
+from lerobot_msdyn.priors.hub import LocalModel, demand_library
+from lerobot_msdyn.priors.registry import Unusable
 
 _NAME = "torchvision raft_small"
 _LICENCE = "BSD-3-Clause"
@@ -19,37 +20,28 @@ _MIN_SIDE, _MULTIPLE = 128, 8  # px: RAFT takes no smaller images, and sides tha
 _UPDATES = 12
 
 
-def find_raft(weights: Path | None) -> LocalModel | None:
-    """The weights on this machine: the given file, else torchvision's own download; None if there are none."""
+def raft_weights(weights: Path | None) -> LocalModel:
+    """The weights on this machine: the given file, else torchvision's own download.
+
+    Raises:
+        Unusable: they, or torchvision, are not on this machine.
+    """
+    demand_library("torchvision", "priors", "RAFT")
     if weights is not None:
-        return LocalModel(_NAME, weights, "local", _LICENCE) if weights.is_file() else None
-    if not has_library("torchvision"):
-        return None
+        if not weights.is_file():
+            raise Unusable(f"there is no {weights}", "priors.raft_weights names it")
+        return LocalModel(_NAME, "local", _LICENCE, weights)
     from torchvision.models.optical_flow import Raft_Small_Weights
 
     name = Path(Raft_Small_Weights.C_T_V2.url).name
     path = Path(torch.hub.get_dir()) / "checkpoints" / name
-    return LocalModel(_NAME, path, Path(name).stem, _LICENCE) if path.is_file() else None
-
-
-def demand_raft(weights: Path | None) -> LocalModel:
-    """The weights, which were asked for.
-
-    Raises:
-        PriorError: they, or torchvision, are not on this machine.
-    """
-    demand_library("torchvision", "priors", "priors.tracks", "raft")
-    model = find_raft(weights)
-    if model is None:
-        where = (
-            f"there is no {weights}" if weights is not None else f"its weights are not on this machine; fetch: {_FETCH}"
-        )
-        raise PriorError(f"priors.tracks is 'raft', but {where}")
-    return model
+    if not path.is_file():
+        raise Unusable("RAFT's weights are not on this machine", f"fetch: {_FETCH}")
+    return LocalModel(_NAME, path.stem, _LICENCE, path)
 
 
 class RaftFlow:
-    """Callable: two pictures -> the flow from the first to the second."""
+    """Callable: two images -> the flow from the first to the second."""
 
     def __init__(self, model: LocalModel, device: str) -> None:
         from torchvision.models.optical_flow import raft_small
@@ -70,7 +62,7 @@ class RaftFlow:
 
     @torch.inference_mode()
     def __call__(self, a: UInt8[ndarray, "h w 3"], b: UInt8[ndarray, "h w 3"]) -> Float32[ndarray, "h w 2"]:
-        """Flow (px) from picture `a` to picture `b`, at their size."""
+        """Flow (px) from image `a` to image `b`, at their size."""
         height, width = a.shape[:2]
         flow = self._network(self._prepared(a), self._prepared(b), num_flow_updates=_UPDATES)[-1]
         return np.ascontiguousarray(flow[0, :, :height, :width].permute(1, 2, 0).cpu().numpy())

@@ -1,0 +1,59 @@
+"""Depth of any kind in metres: what has no scale is aligned to depth that has one."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lerobot_msdyn.core.observations import DepthTraits, Origin
+from lerobot_msdyn.priors.depth.align import align_disparity, align_scale
+from lerobot_msdyn.priors.depth.blurred_edges import sharpened
+from lerobot_msdyn.priors.depth.flying_pixels import without_flying_pixels
+from lerobot_msdyn.priors.exchange import AFFINE_DISPARITY, METRIC
+from lerobot_msdyn.priors.provide import best
+from lerobot_msdyn.priors.registry import Depth, DepthProvider, Estimate, Masks
+from lerobot_msdyn.priors.request import Request
+
+
+def in_metres(
+    request: Request, instances: Masks, values: Float[Tensor, "t h w"], kind: str, *, trusted: bool
+) -> Estimate[Depth]:
+    """Depth without blurred edges: what is near a surface is put on it, and what floats becomes unknown.
+
+    Args:
+        request: the video; other depth of it is the reference.
+        instances: what moves; an assumed reference is not asked there.
+        values: what was predicted.
+        kind: `metric` (m), `scale` (lacks a factor) or `affine_disparity` (inverse depth that lacks a factor and a
+            shift, larger = nearer).
+        trusted: whether metres are true ones. Those of a network are those of an unknown focal length: a reference in
+            true metres corrects them where there is one.
+
+    Raises:
+        PriorError: the values cannot be aligned to the reference.
+    """
+    if kind == METRIC and trusted:
+        z = torch.where(torch.isfinite(values), values, 0.0).clamp(min=0)
+        return _clean(z, True, "in metres")
+    reference, origin = reference_depth(request, instances)
+    true_metres = reference.traits.metric
+    usable = None if reference.traits.measured else instances == 0
+    if kind == AFFINE_DISPARITY:
+        aligned = align_disparity(values, reference.z, usable)
+        return _clean(aligned, true_metres, f"scaled and shifted to {origin.provider}")
+    if kind == METRIC and not true_metres:
+        return _clean(values, False, "in the network's own metres")
+    return _clean(align_scale(values, reference.z, usable), true_metres, f"scaled to {origin.provider}")
+
+
+def reference_depth(request: Request, instances: Masks) -> tuple[Depth, Origin]:
+    """The best depth that other depth may be aligned to: `DepthProvider.is_reference`."""
+    return best(
+        DepthProvider,
+        request,
+        lambda provider: provider.estimate(request, instances),
+        among=lambda provider: provider.is_reference,
+    )
+
+
+def _clean(z: Float[Tensor, "t h w"], true_metres: bool, how: str) -> Estimate[Depth]:
+    return Estimate(Depth(without_flying_pixels(sharpened(z)), DepthTraits(true_metres)), how)

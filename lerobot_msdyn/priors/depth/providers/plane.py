@@ -1,0 +1,22 @@
+"""Depth without a sensor or learned weights: everything stands on a table."""
+
+from lerobot_msdyn.core.observations import DepthTraits
+from lerobot_msdyn.priors.depth.table_plane import table_plane_depth
+from lerobot_msdyn.priors.registry import DEPTH, Depth, DepthProvider, Estimate, Masks
+from lerobot_msdyn.priors.request import Request
+
+
+@DEPTH.register("plane")
+class Plane(DepthProvider):
+    """A table at the height and tilt that `camera.height_m` and `camera.tilt_deg` state; can always be used."""
+
+    rank = 10
+    reads_recorded_depth = False
+    is_reference = True
+
+    def estimate(self, request: Request, instances: Masks) -> Estimate[Depth]:
+        """Assumed, not measured."""
+        height_m, tilt_deg = request.camera.height_m, request.camera.tilt_deg
+        z = table_plane_depth(instances, request.view.camera.intrinsics[0], height_m, tilt_deg)
+        traits = DepthTraits(sharp=True, relative_error=0.10, assumed=True)
+        return Estimate(Depth(z, traits), f"a table seen from {height_m:g} m at {tilt_deg:g} degrees")

@@ -1,0 +1,1 @@
+"""Providers of masks, one per file; a file here is found by its name."""
