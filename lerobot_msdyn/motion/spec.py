@@ -19,7 +19,7 @@ from lerobot_msdyn.motion.finer.residual import ResidualTracks
 from lerobot_msdyn.motion.model.bases import MotionLevel
 from lerobot_msdyn.motion.model.compose import Level
 
-Binding = tuple[Int[Tensor, "n j"], Float[Tensor, "n j"]]  # bases that each point follows, their weights before softmax
+Binding = tuple[Int[Tensor, "n _"], Float[Tensor, "n _"]]  # bases that each point follows, their weights before softmax
 
 
 class LevelSpec(ABC):
