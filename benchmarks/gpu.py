@@ -8,7 +8,7 @@ rasterizer   ms per render and per render with gradients, 8 channels; peak memor
              kernel runs
 parity       pictures and gradients against the CPU route and against the reference in float64
 psnr         the same short video fitted on both routes: held-out PSNR, which should differ by less than 0.2 dB
-episode      a made-up episode by `augment`, two variants, whole; its fit (ms per step, share outside kernels), the
+episode      a synthetic episode by `augment`, two variants, whole; its fit (ms per step, share outside kernels), the
              frames per second of drawing alone and with holes filled, peak memory
 several      as many short episodes, one after the other and at the same time
 

@@ -2,7 +2,7 @@
 
     python benchmarks/pipeline.py [--recipe quick] [--steps N] [--small | --long] [--gate] [--json FILE]
 
-Made-up scenes with recorded depth: a base case, and one run each with twice the frames, twice the width and height,
+Synthetic scenes with recorded depth: a base case, and one run each with twice the frames, twice the width and height,
 twice the variants, and three episodes. Stages: read, priors, initial scene, fit, render (holes filled, not encoded).
 Every run is a process of its own, whose peak of resident memory is given; below it how many times the base case's
 each figure is. `--small`: the same at half the size and half the frames. `--long` reconstructs small videos of 300 and

@@ -1,4 +1,4 @@
-"""The structure that docs/architecture.md draws is the structure that the code has."""
+"""The structure that docs/architecture.md shows is the structure that the code has."""
 
 import ast
 import re

@@ -59,8 +59,8 @@ def test_variants_differ_and_episodes_say_where_they_come_from(augmented: Path) 
     assert not torch.equal(output[starts[1]][FRONT], output[starts[2]][FRONT])
     rows = pq.read_table(augmented / "meta" / "msdyn" / "episodes.parquet").to_pylist()
     assert [(row["source_episode"], row["variant"]) for row in rows] == [(e, v) for e in (0, 2) for v in (-1, 0, 1)]
-    drawn = json.loads(rows[1]["perturbation"])[FRONT]
-    assert abs(drawn["azimuth_deg"]) <= 10
+    sampled = json.loads(rows[1]["perturbation"])[FRONT]
+    assert abs(sampled["azimuth_deg"]) <= 10
 
 
 def test_the_same_command_gives_the_same_pictures(desk: Path, augmented: Path, tmp_path: Path) -> None:
@@ -157,16 +157,16 @@ def half_broken_desk(desk: Path, tmp_path: Path) -> Path:
 def test_a_fault_in_one_episode_does_not_cost_the_others(
     desk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from lerobot_msdyn.augment import run as engines
+    from lerobot_msdyn.augment import run as job
 
-    whole = engines.augment_episode
+    whole = job.augment_episode
 
     def faulty(source: Any, index: int, *rest: Any) -> object:
         if index == 0:
             raise RuntimeError("a fault")
         return whole(source, index, *rest)
 
-    monkeypatch.setattr(engines, "augment_episode", faulty)
+    monkeypatch.setattr(job, "augment_episode", faulty)
     arguments = ["--repo", "local/desk", "--root", str(desk), "--new_root", str(tmp_path / "new")]
     assert run(*arguments, "--episodes", "[0,1]", "--cameras", "[front]", "--variants", "1", *FAST) == 1
     assert "skipped: local/desk episode 0: RuntimeError: a fault" in capsys.readouterr().out
@@ -181,9 +181,9 @@ def content(root: Path) -> dict[Path, bytes]:
 def test_a_run_that_was_stopped_goes_on_and_gives_the_same_files(
     desk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from lerobot_msdyn.augment import run as engines
+    from lerobot_msdyn.augment import run as job
 
-    whole = engines.augment_episode
+    whole = job.augment_episode
     begun: list[int] = []
 
     def stopped(source: Any, index: int, *rest: Any) -> object:
@@ -194,13 +194,13 @@ def test_a_run_that_was_stopped_goes_on_and_gives_the_same_files(
 
     arguments = ["--repo", "local/desk", "--root", str(desk), "--episodes", "[0,2]", "--cameras", "[front]"]
     arguments += ["--variants", "1", *FAST, "--new_repo_id", "local/new"]
-    monkeypatch.setattr(engines, "augment_episode", stopped)
+    monkeypatch.setattr(job, "augment_episode", stopped)
     assert run(*arguments, "--new_root", str(tmp_path / "new")) == 130
     assert "interrupted: 1 episodes are finished and kept in" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
     assert run(*arguments, "--new_root", str(tmp_path / "new"), "--fit.steps", "9") == 2
     assert "started differently: fit.steps was 8, is 9. Start it as before" in capsys.readouterr().err
-    monkeypatch.setattr(engines, "augment_episode", whole)
+    monkeypatch.setattr(job, "augment_episode", whole)
     assert run(*arguments, "--new_root", str(tmp_path / "new")) == 0
     assert run(*arguments, "--new_root", str(tmp_path / "whole")) == 0
     first, second = (

@@ -24,7 +24,7 @@ def episode(shift: torch.Tensor, state: torch.Tensor | None) -> Episode:
     picture = texture.to(torch.uint8).repeat_interleave(4, 0).repeat_interleave(4, 1)
     rgb = torch.stack([picture.roll(int(x), dims=1) for x in shift])
     camera = static_camera(intrinsics_from_fov(WIDTH, HEIGHT, 60.0), FRAMES, WIDTH, HEIGHT)
-    source = EpisodeSource("local/made_up", Path(), 0)
+    source = EpisodeSource("local/synthetic", Path(), 0)
     return Episode(source, 30, torch.arange(FRAMES) / 30, {"top": View(rgb, camera)}, state, None, "")
 
 

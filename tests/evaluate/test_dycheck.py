@@ -1,4 +1,4 @@
-"""Sequences from the command line: fitted, drawn and scored by both protocols."""
+"""Sequences from the command line: fitted, rendered and scored by both protocols."""
 
 import importlib
 import json
@@ -36,10 +36,10 @@ def test_the_fit_beats_the_recorded_picture(
     truth = read_sequence(sequence, protocol)
     assert sorted(path.stem for path in (tmp_path / "rgb").iterdir()) == sorted(truth.validation)
     for name in truth.validation:  # the scores are those of the pictures that were written
-        drawn = read_picture(tmp_path / "rgb" / f"{name}.png")
+        rendered = read_picture(tmp_path / "rgb" / f"{name}.png")
         true, mask = truth.true_picture(name), truth.covisible(name)
-        assert found["images"][name]["mpsnr"] == pytest.approx(masked_psnr_db(drawn, true, mask), abs=1e-4)
-        assert found["images"][name]["mssim"] == pytest.approx(partial_ssim(drawn, true, mask), abs=1e-4)
+        assert found["images"][name]["mpsnr"] == pytest.approx(masked_psnr_db(rendered, true, mask), abs=1e-4)
+        assert found["images"][name]["mssim"] == pytest.approx(partial_ssim(rendered, true, mask), abs=1e-4)
     means = {score: np.mean([image[score] for image in found["images"].values()]) for score in fitted}
     assert fitted == pytest.approx(means, abs=1e-4)
 

@@ -37,13 +37,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def psnr(folder: Path, out: Path, camera: str) -> float:
-    """Of the drawn views over pixels that the recorded camera saw at some time."""
+    """Of the rendered views over pixels that the recorded camera saw at some time."""
     truth = np.load(folder / "gt" / "heldout" / f"{camera}.npz")
     errors = []
     for frame, seen in zip(truth["frame"], np.moveaxis(truth["covis"], -1, 0) > 0, strict=True):
-        drawn = read_picture(out / camera / f"rgb_{frame:04d}.png").astype(float)
+        rendered = read_picture(out / camera / f"rgb_{frame:04d}.png").astype(float)
         true = read_picture(folder / "gt" / "heldout" / camera / f"rgb_{frame:04d}.png").astype(float)
-        errors.append(((drawn - true)[seen] ** 2).mean())
+        errors.append(((rendered - true)[seen] ** 2).mean())
     return float(10 * np.log10(255**2 / np.mean(errors)))
 
 

@@ -64,12 +64,12 @@ def test_the_fit_beats_the_recorded_picture(
 
 
 def test_colours_are_fitted_to_the_other_half_of_the_frames() -> None:
-    drawn = np.random.default_rng(0).integers(0, 100, (4, 30, 40, 3)).astype(np.uint8)
-    true = drawn + np.uint8(50)
-    seen = np.full(drawn.shape[:3], 2, np.uint8)
-    assert score_half(drawn, TrueViews(true, seen))["psnr"] > 50
+    rendered = np.random.default_rng(0).integers(0, 100, (4, 30, 40, 3)).astype(np.uint8)
+    true = rendered + np.uint8(50)
+    seen = np.full(rendered.shape[:3], 2, np.uint8)
+    assert score_half(rendered, TrueViews(true, seen))["psnr"] > 50
     true[1::2] += 20  # of the half that is scored: not made up for
-    assert score_half(drawn, TrueViews(true, seen))["psnr"] == pytest.approx(20 * np.log10(255 / 20), abs=0.2)
+    assert score_half(rendered, TrueViews(true, seen))["psnr"] == pytest.approx(20 * np.log10(255 / 20), abs=0.2)
 
 
 def test_the_black_border_of_undistorted_pictures_is_left_out() -> None:

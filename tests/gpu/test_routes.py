@@ -8,7 +8,7 @@ import torch
 from lerobot_msdyn.augment import __main__ as augment
 from lerobot_msdyn.core.config import Device, Recipe
 from lerobot_msdyn.core.observations import View
-from lerobot_msdyn.reconstruction import reconstruct as pipeline
+from lerobot_msdyn.reconstruction.reconstruct import reconstruct
 from lerobot_msdyn.reconstruction.self_check import decibels
 from lerobot_msdyn.render.availability import cuda_problem
 from lerobot_msdyn.synthetic import make_scene
@@ -33,11 +33,11 @@ def test_both_routes_reach_the_same_held_out_quality() -> None:
     for device in ROUTES:
         recipe = Recipe(device=device)
         recipe.fit.steps, recipe.priors.cache = 200, "off"
-        scene = pipeline.reconstruct(View(seen.rgb, video.camera, seen.depth), recipe)
+        scene = reconstruct(View(seen.rgb, video.camera, seen.depth), recipe)
         assert scene.windows[0].scene.device.type == "cpu"
         found[device] = decibels(float(scene.windows[0].self_check.fitted_error.mean()))
-        drawn = on_device(scene, torch.device(device))
-        pictures[device] = next(new_pictures(drawn, scene.camera)).rgb.astype(float)
+        ready = on_device(scene, torch.device(device))
+        pictures[device] = next(new_pictures(ready, scene.camera)).rgb.astype(float)
     assert abs(found["cuda"] - found["cpu"]) < MAX_DIFFERENCE_DB, found
     assert abs(pictures["cuda"] - pictures["cpu"]).mean() < 2
 
