@@ -1,4 +1,4 @@
-"""Which device a run fits and draws on."""
+"""Which device a run fits and renders on."""
 
 import logging
 from functools import cache
@@ -29,4 +29,4 @@ def chosen_device(name: Device) -> torch.device:
 @cache
 def _say_once(problem: str) -> None:
     level = logging.WARNING if has_cuda_device() else logging.INFO
-    logger.log(level, "fitting and drawing on the CPU: %s", problem)
+    logger.log(level, "fitting and rendering on the CPU: %s", problem)

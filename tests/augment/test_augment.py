@@ -42,9 +42,9 @@ def test_output_is_the_source_seen_from_elsewhere(desk: Path, augmented: Path) -
             assert a["task"] == b["task"]
             changed.append(float((a[FRONT] - b[FRONT]).abs().mean()))
             assert torch.equal(a[f"{FRONT}_depth"], b[f"{FRONT}_depth"]) == (number % 3 == 0), (number, i)
-            known = b[f"{FRONT}_depth"] > 15  # mm; missing pixels come back as 10
-            assert known.float().mean() > 0.5
-            assert 300 < b[f"{FRONT}_depth"][known].median() < 3000
+            measured = b[f"{FRONT}_depth"] > 15  # mm; missing pixels come back as 10
+            assert measured.float().mean() > 0.5
+            assert 300 < b[f"{FRONT}_depth"][measured].median() < 3000
             position += 1
         if number % 3 == 0:
             assert max(changed) == 0
@@ -77,9 +77,9 @@ def test_the_same_command_gives_the_same_pictures(desk: Path, augmented: Path, t
 
 def test_dry_run_writes_nothing(desk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("--repo", "local/desk", "--root", str(desk), "--new_root", str(tmp_path / "new"), "--dry_run") == 0
-    said = capsys.readouterr().out
-    assert "3 episodes, 36 frames" in said
-    assert "2 new per episode: 9 episodes, 108 frames, 144 new pictures" in said
+    printed = capsys.readouterr().out
+    assert "3 episodes, 36 frames" in printed
+    assert "2 new per episode: 9 episodes, 108 frames, 144 new pictures" in printed
     assert list(tmp_path.iterdir()) == []
 
 
@@ -114,11 +114,11 @@ def test_bad_input_is_one_line_and_exit_code_2(desk: Path, tmp_path: Path, capsy
     ]
     for arguments, message in cases:
         assert run(*arguments) == 2, arguments
-        said = capsys.readouterr().err
-        errors = [line for line in said.splitlines() if line.startswith("error: ")]
-        assert len(errors) == 1, said
+        printed = capsys.readouterr().err
+        errors = [line for line in printed.splitlines() if line.startswith("error: ")]
+        assert len(errors) == 1, printed
         assert message in errors[0]
-        assert "Traceback" not in said
+        assert "Traceback" not in printed
         assert not (tmp_path / "new").exists()
     assert not any(path.name.endswith(".partial") for path in tmp_path.iterdir())
 
@@ -128,9 +128,9 @@ def test_a_truncated_video_costs_its_episode_only(
 ) -> None:
     arguments = ["--repo", "local/desk", "--root", str(half_broken_desk), "--new_root", str(tmp_path / "new")]
     assert run(*arguments, "--variants", "1", *FAST) == 1
-    said = capsys.readouterr().out
-    assert "1 of 2 episodes, 1 new ones" in said
-    assert "skipped: local/desk episode 1, observation.images.front" in said
+    printed = capsys.readouterr().out
+    assert "1 of 2 episodes, 1 new ones" in printed
+    assert "skipped: local/desk episode 1, observation.images.front" in printed
     output = LeRobotDataset("local/desk_msdyn", root=tmp_path / "new", video_backend="pyav")
     assert output.num_episodes == 2
     assert np.isfinite([float(output[i][FRONT].mean()) for i in range(len(output))]).all()
@@ -230,10 +230,10 @@ def test_states_that_are_no_numbers_cost_their_episode_only(
     pq.write_table(table.set_column(position, field, pa.array(states, field.type)), path)
     arguments = ["--repo", "local/desk", "--root", str(root), "--new_root", str(tmp_path / "new")]
     assert run(*arguments, "--episodes", "[0,1]", "--cameras", "[front]", "--variants", "1", *FAST) == 1
-    said = capsys.readouterr().out
-    assert "1 of 2 episodes, 1 new ones" in said
-    assert "skipped: local/desk episode 1: in" in said
-    assert "observation.state is not a number in 1 of 12 rows" in said
+    printed = capsys.readouterr().out
+    assert "1 of 2 episodes, 1 new ones" in printed
+    assert "skipped: local/desk episode 1: in" in printed
+    assert "observation.state is not a number in 1 of 12 rows" in printed
 
 
 def test_as_a_module() -> None:

@@ -36,10 +36,10 @@ def stop_and_go() -> torch.Tensor:
 
 def test_a_camera_on_the_arm_moves_when_the_state_does() -> None:
     path = stop_and_go()
-    found = episode(path.round(), path[:, None])
-    assert found.state is not None
-    assert correlation(found.state, found.views["top"].rgb) > 0.8
-    assert "with the robot" in why_moving(found, "top")
+    on_arm = episode(path.round(), path[:, None])
+    assert on_arm.state is not None
+    assert correlation(on_arm.state, on_arm.views["top"].rgb) > 0.8
+    assert "with the robot" in why_moving(on_arm, "top")
     assert "no state" in why_moving(episode(path.round(), None), "top")
 
 

@@ -24,6 +24,6 @@ def test_a_full_gpu_costs_its_episode(monkeypatch: pytest.MonkeyPatch) -> None:
     work = Mock(spec=workers.Work, source=Mock(repo_id="local/desk"), output=Mock())
     work.output.finish_episode.side_effect = torch.OutOfMemoryError("CUDA out of memory")
     monkeypatch.setattr(job, "_make", lambda work, index: None)
-    found = job.attempt(work, 3)
-    assert found is not None
-    assert found.startswith("local/desk episode 3: the memory of the GPU is full; try fewer --workers")
+    reason = job.attempt(work, 3)
+    assert reason is not None
+    assert reason.startswith("local/desk episode 3: the memory of the GPU is full; try fewer --workers")

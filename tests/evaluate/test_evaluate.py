@@ -58,11 +58,11 @@ def unchanged_psnr(folder: Path, camera: str) -> float:
 @pytest.mark.slow
 def test_views_are_close_to_the_true_ones(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("nvs", "--scene", str(folder), "--out", str(tmp_path), *FAST) == 0
-    said = capsys.readouterr().out
-    assert all(stage in said for stage in ("read", "priors and initialisation", "fit", "render"))
+    printed = capsys.readouterr().out
+    assert all(stage in printed for stage in ("read", "priors and initialisation", "fit", "render"))
     cameras = sorted(path.stem for path in (folder / "gt" / "heldout").glob("*.npz"))
     assert {path.name for path in tmp_path.iterdir()} == {*cameras, "scores.json"}
-    assert "| mean |" in said
+    assert "| mean |" in printed
     scores = json.loads((tmp_path / "scores.json").read_text())
     assert sorted(scores["cameras"]) == cameras
     # Measured at this small size: 20.8, 22.2, 21.6, 22.1 dB.
@@ -109,6 +109,6 @@ def test_without_depth_and_without_truth(folder: Path, tmp_path: Path, capsys: p
 )
 def test_bad_input(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(*arguments) == 2
-    said = capsys.readouterr().err
-    assert message in said
-    assert said.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert message in printed
+    assert printed.count("\n") == 1

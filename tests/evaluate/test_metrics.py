@@ -56,15 +56,15 @@ def slow_mssim(rendered: np.ndarray, true: np.ndarray, mask: np.ndarray) -> floa
         rows, seen = slow_pass(values, mask.astype(float), kernel)
         return slow_pass(rows.T, seen.T, kernel)[0].T
 
-    found = []
+    terms = []
     for channel in range(3):
         a, b = rendered[..., channel] / 255, true[..., channel] / 255
         ma, mb = mean(a), mean(b)
         va, vb = np.maximum(mean(a * a) - ma**2, 0), np.maximum(mean(b * b) - mb**2, 0)
         cab = mean(a * b) - ma * mb
         cab = np.sign(cab) * np.minimum(np.sqrt(va * vb), np.abs(cab))
-        found.append((2 * ma * mb + 1e-4) * (2 * cab + 9e-4) / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4)))
-    return float(np.mean(found))
+        terms.append((2 * ma * mb + 1e-4) * (2 * cab + 9e-4) / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4)))
+    return float(np.mean(terms))
 
 
 @pytest.mark.parametrize("name", masks())
@@ -77,8 +77,8 @@ def test_mssim_is_the_definition_s(name: str) -> None:
 def test_golden_values_of_mssim() -> None:
     """Printed by `slow_mssim`; what the mask leaves out counts as perfect."""
     rendered, true = pair()
-    found = {name: round(partial_ssim(rendered, true, mask), 3) for name, mask in masks().items()}
-    assert found == {"full": 0.625, "half": 0.824, "few": 0.996, "empty": 1.0, "scattered": 0.869, "weights": 0.793}
+    ssim = {name: round(partial_ssim(rendered, true, mask), 3) for name, mask in masks().items()}
+    assert ssim == {"full": 0.625, "half": 0.824, "few": 0.996, "empty": 1.0, "scattered": 0.869, "weights": 0.793}
 
 
 def test_psnr_is_the_mean_over_the_mask() -> None:
@@ -114,7 +114,7 @@ def slow_inside_ssim(rendered: np.ndarray, true: np.ndarray, mask: np.ndarray) -
     tap = np.exp(-0.5 * ((np.arange(11) - 5) / 1.5) ** 2)
     inside = np.pad(mask, 5)
     a, b = (np.pad(picture / 255, ((5, 5), (5, 5), (0, 0))) for picture in (rendered, true))
-    found = []
+    terms = []
     for i, j in np.argwhere(mask):
         window = np.s_[i : i + 11, j : j + 11]
         weight = (np.outer(tap, tap) * inside[window])[..., None]
@@ -122,8 +122,8 @@ def slow_inside_ssim(rendered: np.ndarray, true: np.ndarray, mask: np.ndarray) -
         ma, mb = (weight * a[window]).sum((0, 1)), (weight * b[window]).sum((0, 1))
         da, db = a[window] - ma, b[window] - mb
         va, vb, cab = (weight * da * da).sum((0, 1)), (weight * db * db).sum((0, 1)), (weight * da * db).sum((0, 1))
-        found.append((2 * ma * mb + 1e-4) * (2 * cab + 9e-4) / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4)))
-    return float(np.mean(found))
+        terms.append((2 * ma * mb + 1e-4) * (2 * cab + 9e-4) / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4)))
+    return float(np.mean(terms))
 
 
 @pytest.mark.parametrize("name", ["full", "half", "few", "scattered"])
