@@ -44,7 +44,7 @@ import pyarrow.parquet as pq
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_msdyn.augment import __main__ as augment
-from lerobot_msdyn.augment import run as engines
+from lerobot_msdyn.augment import run as job
 from lerobot_msdyn.core.cli import run_command
 from lerobot_msdyn.dataset.provenance import Provenance, camera_pose
 from lerobot_msdyn.dataset.read import read_episode
@@ -221,7 +221,7 @@ def break_copy(original: Path, place: Path, rng: random.Random) -> str:
 def command(place: Path, limit_s: int, *, whole: bool) -> tuple[int | None, list[str], str]:
     """Run the command on `place`/ds; the exit code, what went wrong, and what was said."""
     said, code, faults = io.StringIO(), None, []
-    setattr(engines, "augment_episode", REAL if whole else fake_episode)  # noqa: B010 (another signature)
+    setattr(job, "augment_episode", REAL if whole else fake_episode)  # noqa: B010 (another signature)
     logging.basicConfig(level=logging.INFO, stream=said, force=True)
     begin = time.perf_counter()
     signal.alarm(limit_s)
@@ -358,7 +358,7 @@ def main() -> int:
 
 
 FORK = multiprocessing.get_context("fork")
-REAL = engines.augment_episode
+REAL = job.augment_episode
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -8,8 +8,8 @@ rasterizer   ms per render and per render with gradients, 8 channels; peak memor
              kernel runs
 parity       pictures and gradients against the CPU route and against the reference in float64
 psnr         the same short video fitted on both routes: held-out PSNR, which should differ by less than 0.2 dB
-episode      a made-up episode by `augment`, two variants, whole; its fit (ms per step, share outside kernels), the
-             frames per second of drawing alone and with holes filled, peak memory
+episode      a synthetic episode by `augment`, two variants, whole; its fit (ms per step, share outside kernels), the
+             frames per second of rendering alone and with holes filled, peak memory
 several      as many short episodes, one after the other and at the same time
 
 `--device cpu` with small sizes tries the script itself where there is no GPU; parity is then of the CPU route.
@@ -47,7 +47,7 @@ from lerobot_msdyn.views.new_cameras import new_cameras
 from lerobot_msdyn.views.pictures import new_pictures, on_device
 
 KEY = "observation.images.front"
-ALL_KEPT = {  # views are judged, but none is drawn again or dropped
+ALL_KEPT = {  # views are judged, but none is sampled again or dropped
     "max_unseen": 1,
     "gate.min_expected_db": 0,
     "gate.max_track_px": 1e9,
@@ -85,10 +85,10 @@ class Device:
 
     def kernel_ms(self, call: Callable[[], object]) -> float:
         """Time of all kernels of a call, one after the other."""
-        with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as found:
+        with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
             call()
             self.wait()
-        return sum(event.self_device_time_total for event in found.key_averages()) / 1e3
+        return sum(event.self_device_time_total for event in profile.key_averages()) / 1e3
 
     @contextmanager
     def peak_mb(self, row: dict) -> Iterator[None]:
@@ -140,10 +140,10 @@ def parity(target: Device, names: list[str]) -> Iterator[dict]:
     """Pictures and gradients against the CPU route and the reference in float64."""
     for name in names:
         load = make_workload(name, CHANNELS)
-        images = _drawn(on(load, target.device), target.backend)
+        images = _rendered(on(load, target.device), target.backend)
         others = {"CPU": (torch.float32, "cpu"), "reference": (torch.float64, "reference")}
         for label, (dtype, backend) in others.items():
-            expected = _drawn(on(load, torch.device("cpu"), dtype), backend)
+            expected = _rendered(on(load, torch.device("cpu"), dtype), backend)
             error = torch.stack([(a - b).abs().amax(-1) for a, b in zip(images, expected, strict=True)]).amax(0)
             off = float((error > THRESHOLD).double().mean())
             mine = _gradients(on(load, target.device), target.backend, error < THRESHOLD)
@@ -158,7 +158,7 @@ def parity(target: Device, names: list[str]) -> Iterator[dict]:
             }
 
 
-def _drawn(load: Workload, backend: str) -> list[torch.Tensor]:
+def _rendered(load: Workload, backend: str) -> list[torch.Tensor]:
     """Features, depth and alpha in float64 on the host."""
     with torch.no_grad():
         raster = load.forward(backend)
@@ -170,26 +170,26 @@ def _gradients(load: Workload, backend: str, where: torch.Tensor) -> list[torch.
     mask = where.to(load.pose.device)
     incoming = tuple(values * (mask[..., None] if values.ndim == 4 else mask) for values in load.incoming)
     raster = load.forward(backend)
-    found = torch.autograd.grad((raster.features, raster.depth, raster.alpha), load.gaussians, incoming)
-    return [values.double().cpu() for values in found]
+    gradients = torch.autograd.grad((raster.features, raster.depth, raster.alpha), load.gaussians, incoming)
+    return [values.double().cpu() for values in gradients]
 
 
 def psnr(target: Device, options: argparse.Namespace) -> Iterator[dict]:
     """The same video fitted on both routes."""
     video = make_scene("push", 0, options.frames // 2, options.width // 2, options.height // 2)
     seen = video.render(video.camera)
-    found = {}
+    held_out_db = {}
     for device in ("cpu", target.backend):
         config = _config(options, device)
         scene = reconstruct(View(seen.rgb, video.camera, seen.depth), config)
-        found[device] = decibels(float(scene.windows[0].self_check.fitted_error.mean()))
+        held_out_db[device] = decibels(float(scene.windows[0].self_check.fitted_error.mean()))
         steps = scene.windows[0].fit_steps
         yield {
             "case": f"fit on {device}",
-            "held-out dB": found[device],
+            "held-out dB": held_out_db[device],
             "ms per step": 1e3 * scene.seconds["fit"] / steps,
         }
-    yield {"case": "difference", "held-out dB": found[target.backend] - found["cpu"]}
+    yield {"case": "difference", "held-out dB": held_out_db[target.backend] - held_out_db["cpu"]}
 
 
 def episode(target: Device, options: argparse.Namespace, folder: Path) -> Iterator[dict]:
@@ -209,13 +209,13 @@ def episode(target: Device, options: argparse.Namespace, folder: Path) -> Iterat
     if target.is_cuda:
         row["outside kernels"] = 1 - _fit_kernel_ms(target, view, config) / row["ms per step"]
     yield row
-    drawn = on_device(scene, target.device)
-    camera = new_cameras({KEY: drawn}, config, 0, 0).cameras[KEY]
-    row = {"case": "drawing through a new camera"}
+    ready = on_device(scene, target.device)
+    camera = new_cameras({KEY: ready}, config, 0, 0).cameras[KEY]
+    row = {"case": "rendering through a new camera"}
     with target.peak_mb(row):
         for name, call in (
-            ("frames per s, drawn alone", lambda: list(render_frames(drawn.windows[0].scene, camera))),
-            ("frames per s, holes filled, on the host", lambda: list(new_pictures(drawn, camera))),
+            ("frames per s, rendered alone", lambda: list(render_frames(ready.windows[0].scene, camera))),
+            ("frames per s, holes filled, on the host", lambda: list(new_pictures(ready, camera))),
         ):
             row[name] = 1e3 * len(camera) / target.ms(call, runs=3)
     yield row
@@ -224,13 +224,13 @@ def episode(target: Device, options: argparse.Namespace, folder: Path) -> Iterat
 def _fit_kernel_ms(target: Device, view: View, config: AugmentConfig, steps: int = 100) -> float:
     """Time of all kernels of a step of the fit."""
     short = replace(config, fit=replace(config.fit, steps=steps, moving_gain_from=1.0, held_out_frames=0))
-    found = []
+    kernel_ms = []
 
     def profiled(draft: Draft) -> None:
-        found.append(target.kernel_ms(lambda: STEPS["fit"](draft)))
+        kernel_ms.append(target.kernel_ms(lambda: STEPS["fit"](draft)))
 
     reconstruct(view, short, steps=with_steps({"fit": profiled}))
-    return found[0] / steps
+    return kernel_ms[0] / steps
 
 
 def several(target: Device, options: argparse.Namespace, folder: Path) -> Iterator[dict]:

@@ -22,7 +22,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command does, befo
 
 # Imported once: the processes to kill are forked from this one, and spend their time on the work itself.
 from lerobot_msdyn.augment import __main__ as augment
-from lerobot_msdyn.augment import run_identity as identity  # noqa: F401
+from lerobot_msdyn.augment import run_identity  # noqa: F401
 from lerobot_msdyn.core.cli import run_command
 
 BUDGET = ["--fit.steps=30", "--fit.max_width=96", "--scene.moving_gaussians=2000", "--scene.moving_frames=6"]

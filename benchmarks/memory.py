@@ -2,7 +2,7 @@
 
     python benchmarks/memory.py [--episodes 2 8 24] [--frames 60 300 1000 3000] [--size 64x48] [--json FILE] [-- FLAGS]
 
-One process works (`--workers=1`) on made-up datasets with recorded depth: for each of `--episodes` that many of 12
+One process works (`--workers=1`) on synthetic datasets with recorded depth: for each of `--episodes` that many of 12
 frames, and for each of `--frames` one episode of that many. Every run of the command is a process of its own, which
 begins with what its imports take (the first line). The flags behind `--` are those of `lerobot_msdyn.augment`; few
 steps and Gaussians unless they say more.
@@ -26,7 +26,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command does, befo
 
 # Imported once: every process is forked from this one, so that the imports are the same share of all figures.
 from lerobot_msdyn.augment import __main__ as augment
-from lerobot_msdyn.augment import run_identity as identity  # noqa: F401
+from lerobot_msdyn.augment import run_identity  # noqa: F401
 from lerobot_msdyn.augment.report import build  # noqa: F401
 from lerobot_msdyn.core.cli import run_command
 from lerobot_msdyn.synthetic import make_scene

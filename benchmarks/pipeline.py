@@ -2,7 +2,7 @@
 
     python benchmarks/pipeline.py [--recipe quick] [--steps N] [--small | --long] [--gate] [--json FILE]
 
-Made-up scenes with recorded depth: a base case, and one run each with twice the frames, twice the width and height,
+Synthetic scenes with recorded depth: a base case, and one run each with twice the frames, twice the width and height,
 twice the variants, and three episodes. Stages: read, priors, initial scene, fit, render (holes filled, not encoded).
 Every run is a process of its own, whose peak of resident memory is given; below it how many times the base case's
 each figure is. `--small`: the same at half the size and half the frames. `--long` reconstructs small videos of 300 and
@@ -125,9 +125,9 @@ def run(case: Case, recipe: str, steps: int | None) -> dict[str, float]:
     sender.close()
     seconds, peak_mb = receiver.recv()
     process.join()
-    found = {prefix + name: seconds.get(prefix + name, 0.0) for prefix in ("", "cpu ") for name in STAGES}
-    totals = {prefix + "all": sum(found[prefix + name] for name in STAGES) for prefix in ("", "cpu ")}
-    return {name: round(value, 3) for name, value in (found | totals | {"peak MB": peak_mb}).items()}
+    by_stage = {prefix + name: seconds.get(prefix + name, 0.0) for prefix in ("", "cpu ") for name in STAGES}
+    totals = {prefix + "all": sum(by_stage[prefix + name] for name in STAGES) for prefix in ("", "cpu ")}
+    return {name: round(value, 3) for name, value in (by_stage | totals | {"peak MB": peak_mb}).items()}
 
 
 def growth(row: dict[str, float], base: dict[str, float], columns: tuple[str, ...]) -> str:
@@ -148,13 +148,13 @@ def violations(rows: list[dict], baseline: list[dict]) -> list[str]:
     if [[row[key] for key in given] for row in rows] != [[row[key] for key in given] for row in baseline]:
         sys.exit(f"{BASELINE.name} is of other cases than these; expected --small --steps {baseline[0]['steps']}")
     judged = [f"cpu {name}" for name in (*STAGES, "all") if baseline[0][f"cpu {name}"] >= LEAST_S] + ["peak MB"]
-    found = []
+    wrong = []
     for row, past in zip(rows[1:], baseline[1:], strict=True):
         for name in judged:
             now, before = row[name] / rows[0][name], past[name] / baseline[0][name]
             if now > SLACK * before:
-                found.append(f"{row['name']}: {name} is {now:.2f} times the base case's; the baseline has {before:.2f}")
-    return found
+                wrong.append(f"{row['name']}: {name} is {now:.2f} times the base case's; the baseline has {before:.2f}")
+    return wrong
 
 
 def main() -> int:

@@ -34,7 +34,10 @@ from lerobot_msdyn.render.types import COVARIANCE_BLUR, MIN_ALPHA
 WORKLOADS = {"W1": (20_000, 320, 240), "W2": (60_000, 640, 480), "W3": (5_000, 160, 120)}  # Gaussians, px, px
 LARGE = {"HD": (200_000, 1280, 720)}  # for a GPU (benchmarks/gpu.py)
 LEAST_RATIO = {"W1": 20.0, "W2": 17.0}  # forward and backward, 8 channels, 1 thread
-VECTOR_OPERATIONS = {"composite_forward": 28, "composite_backward": 48}  # per drawn pixel at 8 channels, by hand count
+VECTOR_OPERATIONS = {
+    "composite_forward": 28,
+    "composite_backward": 48,
+}  # per rendered pixel at 8 channels, by hand count
 SLOWER_THAN_BASELINE = 1.25  # of the ratio to the reference
 BASELINE = Path(__file__).with_suffix(".json")
 
@@ -172,24 +175,24 @@ def cost_split(name: str, channels: int) -> dict[str, float]:
     finally:
         cpu_backend.run = original
     split = {kernel: round(min(values), 3) for kernel, values in times.items()}
-    pixels, rate = drawn_pixels(load), lane_operations_per_ms()
+    pixels, rate = rendered_pixels(load), lane_operations_per_ms()
     peak = {
         f"{kernel}_share_of_peak": round(pixels * 1e6 * operations / rate / split[kernel], 2)
         for kernel, operations in VECTOR_OPERATIONS.items()
     }
-    return {**split, **peak, "memory_mb": round(max(sizes.values()), 1), "pixels_drawn_millions": pixels}
+    return {**split, **peak, "memory_mb": round(max(sizes.values()), 1), "pixels_rendered_millions": pixels}
 
 
 def lane_operations_per_ms() -> float:
     """Vector operations, counted by lane, that one thread can do: the multiply-adds of a matrix product, the best of 9.
 
-    With it, the share of the peak is that of an ideal kernel that only blends the pixels that are drawn.
+    With it, the share of the peak is that of an ideal kernel that only blends the pixels that are rendered.
     """
     a = torch.rand(768, 768)
     return len(a) ** 3 / min(timed(lambda: a @ a)[1] for _ in range(9))
 
 
-def drawn_pixels(load: Workload) -> float:
+def rendered_pixels(load: Workload) -> float:
     """Millions of (Gaussian, pixel) pairs with an alpha of at least 1/255, from the areas of the ellipses."""
     means, quats, scales, opacities, _ = (values.detach().double() for values in load.gaussians)
     pose, focal = load.pose[0].double(), load.intrinsics[0, 0, 0].double()
@@ -240,17 +243,17 @@ def violations(rows: list[dict], baseline: list[dict]) -> list[str]:
     """What `--gate` refuses: one-thread ratios below the least, or well below the committed baseline's."""
     keys = ("workload", "channels", "pass", "threads")
     before = {tuple(row[key] for key in keys): row["ratio"] for row in baseline}
-    found = []
+    failures = []
     for row in (row for row in rows if row["threads"] == 1):
         name = " ".join(str(row[key]) for key in keys)
         if (row["channels"], row["pass"]) == (8, "fwd_bwd"):
             least = LEAST_RATIO.get(row["workload"], 0)
             if row["ratio"] < least:
-                found.append(f"{name}: {row['ratio']} times the reference; expected at least {least}")
+                failures.append(f"{name}: {row['ratio']} times the reference; expected at least {least}")
         past = before.get(tuple(row[key] for key in keys))
         if past is not None and row["ratio"] * SLOWER_THAN_BASELINE < past:
-            found.append(f"{name}: {row['ratio']} times the reference; the baseline has {past}")
-    return found
+            failures.append(f"{name}: {row['ratio']} times the reference; the baseline has {past}")
+    return failures
 
 
 def report(rows: list[dict]) -> None:

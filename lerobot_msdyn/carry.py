@@ -46,22 +46,22 @@ def carry_provenance(root: Path, sources: list[Path]) -> int:
     from lerobot_msdyn.dataset.provenance import write_rows
     from lerobot_msdyn.dataset.read import open_source
 
-    known: dict[Mark, list[dict[str, Any]]] = {}
+    rows_by_mark: dict[Mark, list[dict[str, Any]]] = {}
     origin: dict[str | None, dict[str, Any]] = {}
     for source in sources:
         for mark, row in _known_episodes(source):
-            known.setdefault(mark, []).append(row)
+            rows_by_mark.setdefault(mark, []).append(row)
             if row.get("recipe_sha256"):
                 origin[mark[0]] = {name: row[name] for name in ("source_repo_id", "source_episode")}
     meta = open_source(root.name, root)
     rows = []
     for index, mark in enumerate(_marks(meta)):
-        found = [row | origin.get(mark[0], {}) for row in known.get(mark, [])]
-        found = [row for row in found if row.get("recipe_sha256")] or found
-        if len({(row["source_repo_id"], row["source_episode"], row["variant"]) for row in found}) != 1:
-            said = "several of the sources, which disagree about it" if found else "none of the sources"
-            raise DatasetError(f"{root}: episode {index} is in {said}: {', '.join(map(str, sources))}")
-        rows.append(found[0])
+        candidates = [row | origin.get(mark[0], {}) for row in rows_by_mark.get(mark, [])]
+        candidates = [row for row in candidates if row.get("recipe_sha256")] or candidates
+        if len({(row["source_repo_id"], row["source_episode"], row["variant"]) for row in candidates}) != 1:
+            where = "several of the sources, which disagree about it" if candidates else "none of the sources"
+            raise DatasetError(f"{root}: episode {index} is in {where}: {', '.join(map(str, sources))}")
+        rows.append(candidates[0])
     names = sorted({name for row in rows for name in row} - {"episode_index"})
     write_rows(root, [{name: row.get(name) for name in names} for row in rows])
     write_card(root, meta.repo_id)

@@ -73,8 +73,8 @@ def split_by_source(root: Path, share: float = 0.2) -> Split:
     if not 0 < share < 1:
         raise ConfigError(f"eval_split is {share}; expected a share between 0 and 1")
     meta = open_source(root.name, root)
-    known = provenance_of(meta)
-    recorded = {i for i in range(meta.total_episodes) if known is None or known[i]["variant"] == SOURCE_VARIANT}
+    rows = provenance_of(meta)
+    recorded = {i for i in range(meta.total_episodes) if rows is None or rows[i]["variant"] == SOURCE_VARIANT}
     group = recordings(meta)
     sides = [_sides(episodes, group, recorded, share) for episodes in _by_task(meta, group)]
     shares = [len(held) / (len(train) + len(held)) for train, held in sides if train]
@@ -103,9 +103,9 @@ def _by_task(meta: "LeRobotDatasetMetadata", group: list[int]) -> list[list[int]
 
 def _sides(episodes: list[int], group: list[int], recorded: set[int], share: float) -> tuple[list[int], list[int]]:
     """The episodes of one task to train on and those to hold out."""
-    found = list(dict.fromkeys(group[index] for index in episodes))
-    count = max(1, round(share * len(found)))
-    held = set(found[len(found) - count :])
+    recordings_of_task = list(dict.fromkeys(group[index] for index in episodes))
+    count = max(1, round(share * len(recordings_of_task)))
+    held = set(recordings_of_task[len(recordings_of_task) - count :])
     out = [index for index in episodes if group[index] in held]
     return [index for index in episodes if group[index] not in held], [i for i in out if i in recorded] or out
 
@@ -123,9 +123,9 @@ def run(arguments: list[str]) -> int:
     config = parse_config(SplitConfig, arguments, {}, command=COMMAND)
     if config.root is None:
         raise ConfigError(f"which dataset? {COMMAND} --root FOLDER (see --help)")
-    found = split_by_source(config.root, config.eval_split)
-    logger.info("%d episodes to train on, %d to evaluate on", len(found.train), len(found.evaluation))
-    sys.stdout.write(" ".join(found.arguments) + "\n")
+    split = split_by_source(config.root, config.eval_split)
+    logger.info("%d episodes to train on, %d to evaluate on", len(split.train), len(split.evaluation))
+    sys.stdout.write(" ".join(split.arguments) + "\n")
     return EXIT_OK
 
 

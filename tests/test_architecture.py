@@ -1,4 +1,4 @@
-"""The structure that docs/architecture.md draws is the structure that the code has."""
+"""The structure that docs/architecture.md shows is the structure that the code has."""
 
 import ast
 import re
@@ -27,17 +27,17 @@ def documented_order() -> list[str]:
 
 def imports() -> list[tuple[str, str, Path]]:
     """(module that imports, what it imports, file)."""
-    found = []
+    pairs = []
     for path in PACKAGE.rglob("*.py"):
         here = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ImportFrom):
                 assert node.level == 0, f"{path}: relative import"
                 assert all(alias.name != "*" for alias in node.names), f"{path}: wildcard import"
-                found.append((here, node.module or "", path))
+                pairs.append((here, node.module or "", path))
             elif isinstance(node, ast.Import):
-                found += [(here, alias.name, path) for alias in node.names]
-    return found
+                pairs += [(here, alias.name, path) for alias in node.names]
+    return pairs
 
 
 def _file(path: Path) -> str:

@@ -99,9 +99,9 @@ def test_provenance_is_carried_over(desk: Path, outputs: tuple[Path, Path], merg
     assert carry_provenance(merged, [desk, *outputs]) == 15
     rows = read_provenance(merged)
     assert rows is not None
-    found = [(row["source_repo_id"], row["source_episode"], row["variant"]) for row in rows]
-    assert found[:3] == [("local/desk", e, -1) for e in (0, 1, 2)]
-    assert found[3:] == [("local/desk", e, v) for _ in outputs for e in (0, 1, 2) for v in (-1, 0)]
+    origins = [(row["source_repo_id"], row["source_episode"], row["variant"]) for row in rows]
+    assert origins[:3] == [("local/desk", e, -1) for e in (0, 1, 2)]
+    assert origins[3:] == [("local/desk", e, v) for _ in outputs for e in (0, 1, 2) for v in (-1, 0)]
     assert [row["seed"] for row in rows if row["variant"] == 0] == [1, 1, 1, 2, 2, 2]
     assert "6 of the 15 episodes of this dataset are synthetic" in (merged / "README.md").read_text()
     split = split_by_source(merged, 0.34)

@@ -49,9 +49,9 @@ def run(command: list[str], home: Path) -> str:
 @pytest.mark.slow
 def test_augment_and_train(tmp_path: Path) -> None:
     write_dataset([make_scene("push", 0, 10, 64, 48)], "local/ds", tmp_path / "local" / "ds")
-    said = run(shlex.split(augment_command()), tmp_path)
-    assert "1 of 1 episodes, 2 new ones" in said
+    printed = run(shlex.split(augment_command()), tmp_path)
+    assert "1 of 1 episodes, 2 new ones" in printed
     assert (tmp_path / "local" / "ds_msdyn" / "meta" / "info.json").is_file()
-    said = run([*shlex.split(train_command()), f"--output_dir={tmp_path / 'run'}", *SMALL_ACT], tmp_path)
-    assert "dataset.num_episodes=3" in said
-    assert "End of training" in said
+    printed = run([*shlex.split(train_command()), f"--output_dir={tmp_path / 'run'}", *SMALL_ACT], tmp_path)
+    assert "dataset.num_episodes=3" in printed
+    assert "End of training" in printed

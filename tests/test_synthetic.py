@@ -210,10 +210,10 @@ def test_tracks_stay_on_their_surface(everything: SyntheticScene, view: Syntheti
     column, row = tracks.xy[point, time].long().unbind(-1)
     camera_points = transform_points(everything.camera.camera_from_world, tracks.positions.transpose(0, 1))
     gap = camera_points[time, point, 2] - view.depth[time, row, column]
-    own = view.instances[time, row, column] == tracks.instance[point]
+    same = view.instances[time, row, column] == tracks.instance[point]
     # up to half a pixel from the pixel's centre: edges may show another instance
-    assert own.float().mean() > 0.85
-    assert gap[own].abs().median() < 0.001
+    assert same.float().mean() > 0.85
+    assert gap[same].abs().median() < 0.001
     hidden, time = (~tracks.visible).nonzero(as_tuple=True)
     column, row = tracks.xy[hidden, time].long().unbind(-1)
     inside = (column >= 0) & (column < WIDTH) & (row >= 0) & (row < HEIGHT)
@@ -286,8 +286,8 @@ def test_heldout_cameras_are_where_they_say() -> None:
 
 def test_covisibility(everything: SyntheticScene, view: SyntheticView) -> None:
     frames = [2, 7]
-    own = covisibility(everything, view.depth.numpy(), everything.camera.select(frames), frames)
-    assert (own[:, 1:-1, 1:-1] == 2).all()
+    covered = covisibility(everything, view.depth.numpy(), everything.camera.select(frames), frames)
+    assert (covered[:, 1:-1, 1:-1] == 2).all()
     camera = heldout_cameras(2, WIDTH, HEIGHT)["az+10"]
     values = covisibility(everything, view.depth.numpy(), camera, frames)
     share = np.bincount(values.ravel(), minlength=3) / values.size

@@ -58,22 +58,22 @@ def shared_backgrounds(
             )
             for key, view in episode.views.items():
                 views[key][index] = few_frames(view).shrunk(recipe.fit.max_width)
-    found: dict[str, list[SharedBackground]] = {}
-    for key, some in views.items():
-        indices = list(some)
+    backgrounds: dict[str, list[SharedBackground]] = {}
+    for key, of_episodes in views.items():
+        indices = list(of_episodes)
 
         def moving(
             numbers: Sequence[int], frames: Tensor, key: str = key, indices: list[int] = indices
         ) -> Iterable[Tensor]:
             tasks = [MaskTask(indices[number], key, recipe, frames.numpy()) for number in numbers]
-            found = (
+            masks = (
                 (moving_in_episode(source, task) for task in tasks) if run is None else run(moving_in_episode, tasks)
             )
-            return map(torch.from_numpy, found)
+            return map(torch.from_numpy, masks)
 
         with torch_on_one_thread():
-            found[key] = share_backgrounds(list(some.values()), moving, recipe)
-    return found
+            backgrounds[key] = share_backgrounds(list(of_episodes.values()), moving, recipe)
+    return backgrounds
 
 
 def moving_in_episode(source: LeRobotDatasetMetadata, task: MaskTask) -> UInt8[ndarray, "t h w"]:

@@ -76,8 +76,8 @@ def measure_speeds(source: LeRobotDatasetMetadata, index: int, cameras: list[str
         scene_bytes, frame_bytes = scene_bytes + once, frame_bytes + each
         with tempfile.TemporaryDirectory() as folder:
             start = time.perf_counter()
-            drawn = on_device(scene, chosen_device(recipe.device))
-            pictures = by_feature(source, {key: new_pictures(drawn, part.camera)})
+            scene_here = on_device(scene, chosen_device(recipe.device))
+            pictures = by_feature(source, {key: new_pictures(scene_here, part.camera)})
             stage_pictures(source, Path(folder), pictures, len(part.rgb))
             render_s += (time.perf_counter() - start) / len(part.rgb)
     return Speeds(read_s, prepare_s, step_s, render_s, scene_bytes, frame_bytes)

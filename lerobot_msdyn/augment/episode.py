@@ -67,7 +67,7 @@ def augment_episode(
             key=key,
         )
         scenes[key] = kept.keep(f"{SCENE}_{key}", make_scene)
-    drawn = {key: on_device(scene, chosen_device(recipe.device)) for key, scene in scenes.items()}
+    ready = {key: on_device(scene, chosen_device(recipe.device)) for key, scene in scenes.items()}
     priors = {key: scene.provenance for key, scene in scenes.items()}
     other = _other_pose(recipe, index, episode.views[cameras[0]])
     new = []
@@ -75,7 +75,7 @@ def augment_episode(
         new.append(NewEpisode(index, Provenance(source.repo_id, index, SOURCE_VARIANT, recipe.seed, {}, priors)))
     for variant in range(recipe.variants):
         progress(f"episode {index}: rendering variant {variant}", 0.0)
-        make_episode = functools.partial(_rendered, source, index, variant, recipe, output, drawn, other)
+        make_episode = functools.partial(_rendered, source, index, variant, recipe, output, ready, other)
         new.append(kept.keep(f"variant_{variant:02d}", make_episode))
         progress("", 0.5 / recipe.variants)
     if recipe.save_scenes:
@@ -95,35 +95,35 @@ def _rendered(
 ) -> NewEpisode:
     """One new episode, rendered and encoded; nothing is rendered of one that was dropped."""
     start = time.perf_counter()
-    found, gate = _accepted(scenes, recipe, index, variant, other)
+    chosen, gate = _accepted(scenes, recipe, index, variant, other)
     seconds = {"judging": round(time.perf_counter() - start, 1)}
     seconds |= {f"fitting {key}": round(scene.seconds["fit"], 1) for key, scene in scenes.items()}
     dropped = gate["rejected"][-1] if len(gate["rejected"]) > recipe.gate.redraws else ""
-    new = _staged(source, index, variant, recipe, output, scenes, found, gate, dropped=dropped)
+    new = _staged(source, index, variant, recipe, output, scenes, chosen, gate, dropped=dropped)
     return replace(new, seconds=seconds)
 
 
 def _accepted(
     scenes: Mapping[str, Reconstruction], recipe: Recipe, index: int, variant: int, other: Tensor | None
 ) -> tuple[NewCameras, dict[str, Any]]:
-    """The cameras of one new episode, drawn again where they are rejected, and the gate's record."""
+    """The cameras of one new episode, sampled again where they are rejected, and the gate's record."""
     rejected: list[str] = []
     for attempt in range(recipe.gate.redraws + 1):
-        found = new_cameras(scenes, recipe, index, variant, attempt, other)
+        chosen = new_cameras(scenes, recipe, index, variant, attempt, other)
         views: dict[str, dict[str, Any]] = {
             key: {"distance_m": scene.distance, "what_moves": scene.account.entry()} for key, scene in scenes.items()
         }
-        why = [found.rejected] if found.rejected else []
+        why = [chosen.rejected] if chosen.rejected else []
         for key, scene in scenes.items():
             if recipe.gate.enabled:
-                scores = judge(scene.windows, found.cameras[key])
+                scores = judge(scene.windows, chosen.cameras[key])
                 views[key]["scores"] = record(scores)
                 why += [f"{key}: {reason}" for reason in reasons(scores, recipe.gate)]
         if not why:
             break
         rejected.append("; ".join(why))
-        logger.warning("episode %d variant %d, draw %d: rejected: %s", index, variant, attempt, rejected[-1])
-    return found, {"views": views, "rejected": rejected}
+        logger.warning("episode %d variant %d, sample %d: rejected: %s", index, variant, attempt, rejected[-1])
+    return chosen, {"views": views, "rejected": rejected}
 
 
 def _staged(
@@ -133,7 +133,7 @@ def _staged(
     recipe: Recipe,
     output: OutputDataset,
     scenes: Mapping[str, Reconstruction],
-    found: NewCameras,
+    chosen: NewCameras,
     gate: dict[str, Any],
     *,
     dropped: str,
@@ -143,17 +143,17 @@ def _staged(
         index,
         variant,
         recipe.seed,
-        found.amounts,
+        chosen.amounts,
         {key: scene.provenance for key, scene in scenes.items()},
-        {key: camera_pose(scene.camera, found.cameras[key]) for key, scene in scenes.items()},
+        {key: camera_pose(scene.camera, chosen.cameras[key]) for key, scene in scenes.items()},
         gate,
     )
     if dropped:
         return NewEpisode(index, provenance, dropped=dropped)
-    pictures = {key: new_pictures(scene, found.cameras[key], fill=recipe.fill) for key, scene in scenes.items()}
+    pictures = {key: new_pictures(scene, chosen.cameras[key], fill=recipe.fill) for key, scene in scenes.items()}
     masks = UnseenMasks() if recipe.masks else None
     if masks is not None:
-        pictures = {key: masks.kept(key, some) for key, some in pictures.items()}
+        pictures = {key: masks.kept(key, frames) for key, frames in pictures.items()}
     frames = by_feature(source, pictures, depth=recipe.render_depth)
     new = output.stage(index, variant, frames, provenance)
     return new if masks is None else replace(new, masks=masks.arrays())

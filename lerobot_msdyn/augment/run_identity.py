@@ -80,8 +80,8 @@ def code_digest() -> str:
 
 def recipe_text(config: Recipe) -> str:
     """The settings as a recipe file, without the user's folders."""
-    known = {item.name for item in dataclasses.fields(Recipe)}
-    settings = {key: value for key, value in draccus.encode(config).items() if key in known}
+    fields = {item.name for item in dataclasses.fields(Recipe)}
+    settings = {key: value for key, value in draccus.encode(config).items() if key in fields}
     settings["priors"].pop("cache")
     return yaml.safe_dump(settings)
 

@@ -63,8 +63,8 @@ class Work:
         def make() -> Backgrounds:
             return shared_backgrounds(self.source, self.cameras, self.config, self.run)
 
-        found: Backgrounds = self.output.staging.keep("backgrounds", make)
-        return found
+        backgrounds: Backgrounds = self.output.staging.keep("backgrounds", make)
+        return backgrounds
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def _memory() -> int:
 
 
 def _room_on_gpu(config: AugmentConfig) -> float:
-    """How many workers a GPU has memory for, where they draw on one."""
+    """How many workers a GPU has memory for, where they render on one."""
     if chosen_device(config.device).type == "cpu":
         return math.inf
     return torch.cuda.mem_get_info()[0] // GPU_MEMORY_EACH
@@ -140,10 +140,10 @@ class Workers:
         self.count = count
         context = multiprocessing.get_context("spawn")
         theirs, self._ours = context.Pipe(duplex=False)
-        self._said: Queue = context.Queue()
-        self._listener = threading.Thread(target=_listen, args=(self._said, work.progress), daemon=True)
+        self._messages: Queue = context.Queue()
+        self._listener = threading.Thread(target=_listen, args=(self._messages, work.progress), daemon=True)
         threads = _share_of_threads(count)
-        self._pool = ProcessPoolExecutor(count, context, _begin, (_place_of(work), threads, theirs, self._said))
+        self._pool = ProcessPoolExecutor(count, context, _begin, (_place_of(work), threads, theirs, self._messages))
 
     def __enter__(self) -> "Workers":
         self._listener.start()
@@ -154,9 +154,9 @@ class Workers:
             self._ours.close()  # they end at once
         self._pool.shutdown(wait=True, cancel_futures=True)
         self._ours.close()
-        self._said.put(None)
+        self._messages.put(None)
         self._listener.join()
-        self._said.close()
+        self._messages.close()
 
     def map[A, B](self, function: Callable[[Work, A], B], items: Iterable[A]) -> Iterator[B]:
         """What a function of a module makes of each item, in their order.
@@ -197,11 +197,11 @@ def _interrupts_held() -> Iterator[None]:
 _here: list[Work] = []  # that of this worker
 
 
-def _begin(place: _Place, threads: int, parent: Connection, said: Queue) -> None:
+def _begin(place: _Place, threads: int, parent: Connection, messages: Queue) -> None:
     """Make a new process a worker."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-    logging.basicConfig(level=logging.INFO, handlers=[logging.handlers.QueueHandler(said)], force=True)
+    logging.basicConfig(level=logging.INFO, handlers=[logging.handlers.QueueHandler(messages)], force=True)
     logging.getLogger(chosen_device.__module__).setLevel(logging.ERROR)  # its parent has said what is used
     tqdm.set_lock(threading.RLock())  # its own is for several processes, and left behind by one that ends at once
     torch.set_num_threads(threads)
@@ -210,7 +210,7 @@ def _begin(place: _Place, threads: int, parent: Connection, said: Queue) -> None
     config, source = _config_at(place), open_source(place.repo_id, place.root)
     staging = Staging(place.new_root, lock=False)
     output = OutputDataset(source, place.new_repo_id, place.new_root, staging, nvenc=config.nvenc)
-    _here.append(Work(source, place.cameras, config, output, lambda what, share: said.put((what, share))))
+    _here.append(Work(source, place.cameras, config, output, lambda what, share: messages.put((what, share))))
 
 
 def _end_with(parent: Connection) -> None:
@@ -228,9 +228,9 @@ def _with_source(work: Work, call: tuple[Callable[[LeRobotDatasetMetadata, MaskT
     return function(work.source, task)
 
 
-def _listen(said: Queue, progress: Progress) -> None:
+def _listen(messages: Queue, progress: Progress) -> None:
     """Log here what workers log, and report their progress, until there is nothing more to come."""
-    while (message := said.get()) is not None:
+    while (message := messages.get()) is not None:
         if isinstance(message, logging.LogRecord):
             logging.getLogger(message.name).handle(message)
         else:

@@ -179,12 +179,12 @@ def _merge(base: dict[str, Any], part: dict[str, Any]) -> dict[str, Any]:
 def _unknown_fields(config_class: type, merged: dict[str, Any], part: dict[str, Any], prefix: str = "") -> list[str]:
     """One line per field of `part` that the config does not have, with the nearest name that it has."""
     hints = typing.get_type_hints(config_class)
-    known = [field.name for field in dataclasses.fields(config_class)]
+    names = [field.name for field in dataclasses.fields(config_class)]
     lines = []
     for key, value in part.items():
-        if key not in known:
-            near = difflib.get_close_matches(str(key), known, n=1)
-            hint = f", did you mean {prefix + near[0]!r}?" if near else f"; known: {', '.join(known)}"
+        if key not in names:
+            near = difflib.get_close_matches(str(key), names, n=1)
+            hint = f", did you mean {prefix + near[0]!r}?" if near else f"; expected one of {', '.join(names)}"
             lines.append(f"unknown field {prefix + str(key)!r}{hint}")
             continue
         field_class = hints[key]

@@ -6,7 +6,7 @@
     │   └── EpisodeError       one episode cannot be read or reconstructed: it is skipped, the others go on
     ├── OutputError            the place to write to is taken or cannot be written
     ├── PriorError             a prior (mask, depth, tracks, camera) was demanded and cannot be had
-    ├── RenderError            the rasterizer was given tensors that it cannot draw
+    ├── RenderError            the rasterizer was given tensors that it cannot render
     └── WorkerError            a process that worked on episodes ended unexpectedly
 
 A message says what, where, got, expected and what to do next.
@@ -38,7 +38,7 @@ class PriorError(MsdynError):
 
 
 class RenderError(MsdynError):
-    """The rasterizer was given tensors that it cannot draw."""
+    """The rasterizer was given tensors that it cannot render."""
 
 
 class WorkerError(MsdynError):

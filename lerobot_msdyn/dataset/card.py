@@ -25,7 +25,7 @@ that were moved. Actions, states and times are those of the recording.
 {sources}
 
 `meta/msdyn/episodes.parquet` says for every episode from which recording it comes, which variant it is, and what was
-drawn for its camera; `meta/msdyn/recipe.yaml` is the recipe.{models}
+sampled for its camera; `meta/msdyn/recipe.yaml` is the recipe.{models}
 
 ### Limits
 
@@ -90,7 +90,7 @@ def licence_of(root: Path) -> str | None:
         if path.stat().st_size > MAX_CARD_BYTES:
             return None
         _, head, _ = path.read_text(encoding="utf-8").split("---\n", 2)
-        found = yaml.safe_load(head).get("license")
+        licence = yaml.safe_load(head).get("license")
     except (OSError, ValueError, AttributeError, RecursionError, yaml.YAMLError, DatasetError):
         return None
-    return found if isinstance(found, str) else None
+    return licence if isinstance(licence, str) else None

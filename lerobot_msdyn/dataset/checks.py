@@ -148,9 +148,9 @@ def _check_info(info: dict[str, Any], where: Path, *, has_video: bool) -> None:
         need(name not in info or _is_positive(info[name]), name, "a number above 0")
     need(isinstance(info.get("robot_type"), str | None), "robot_type", "text")
     need(isinstance(info.get("tools"), list | None), "tools", "a list")
-    for name, known in PATH_FIELDS.items():
+    for name, fields in PATH_FIELDS.items():
         if name in info and (info[name] is not None or name == "data_path" or has_video):
-            problem = template_problem(info[name], known)
+            problem = template_problem(info[name], fields)
             if problem:
                 raise DatasetError(f"{where}: {name} is {_short(info[name])}, {problem}")
 
@@ -164,8 +164,8 @@ def _is_positive(value: Any) -> bool:
     return is_finite(value) and value > 0
 
 
-def template_problem(template: object, known: set[str]) -> str | None:
-    """What is wrong with a path template; None if it names a file inside the dataset, by known fields only."""
+def template_problem(template: object, fields: set[str]) -> str | None:
+    """What is wrong with a path template; None if it names a file inside the dataset, by these fields only."""
     if not isinstance(template, str) or not template:
         return "which is no path"
     if template.startswith(("/", "\\", "~")) or ".." in re.split(r"[/\\]", template) or "\0" in template:
@@ -177,8 +177,8 @@ def template_problem(template: object, known: set[str]) -> str | None:
     for _, field, form, conversion in parts:
         if field is None:
             continue
-        if field not in known:
-            return f"whose field {_short(field)} is not one of {', '.join(sorted(known))}"
+        if field not in fields:
+            return f"whose field {_short(field)} is not one of {', '.join(sorted(fields))}"
         if conversion or not re.fullmatch(r"(0?\d)?d?" if field in PLACES else "", form or ""):
             return f"whose field {field} has the form {_short(form or conversion)}"
     return None
@@ -234,8 +234,8 @@ def _check_options(name: str, options: object) -> None:
             pairs = [pair.partition("=")[::2] for pair in value.split(":")]
         else:
             pairs = [(option, str(value))] if option in SAFE_OPTIONS else [("", "")]
-        known = SAFE_PARAMS if option in PARAMS_OPTIONS else SAFE_OPTIONS
-        if options and not all(key in known and re.fullmatch(r"[\w.+-]*", text) for key, text in pairs):
+        allowed = SAFE_PARAMS if option in PARAMS_OPTIONS else SAFE_OPTIONS
+        if options and not all(key in allowed and re.fullmatch(r"[\w.+-]*", text) for key, text in pairs):
             raise DatasetError(
                 f"{name} has encoder options {_short(options)}; only {', '.join(sorted(SAFE_OPTIONS | SAFE_PARAMS))} "
                 "are passed on: remove the others from its video.extra_options"

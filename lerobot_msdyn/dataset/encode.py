@@ -24,7 +24,7 @@ from lerobot_msdyn.dataset.video import VideoFile, encoder_of, nvenc_of, problem
 Stats = dict[str, dict[str, np.ndarray]]
 
 OPAQUE = 255
-AHEAD = 16  # times that may be drawn before they are encoded; it bounds the memory
+AHEAD = 16  # times that may be rendered before they are encoded; it bounds the memory
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def stage_pictures(
 ) -> StagedPictures:
     """Encode the frames of an episode as their features are encoded in the source, and decode them again.
 
-    Frames are encoded in a thread, while the next ones are drawn.
+    Frames are encoded in a thread, while the next ones are rendered.
 
     Args:
         source: the dataset whose features they are.
@@ -74,7 +74,7 @@ def stage_pictures(
             for writer in writers.values():
                 writer.close()
     if count != length:
-        raise OutputError(f"{folder}: {count} frames were drawn; expected {length}")
+        raise OutputError(f"{folder}: {count} frames were rendered; expected {length}")
     for writer in writers.values():
         writer.check(length)
     return StagedPictures(
@@ -147,7 +147,7 @@ class _FeatureWriter:
             return
         problem = problem_of(self.path, length, self._fps, self._size, self._levels or None)
         if problem is not None:
-            raise OutputError(f"{self.path} was written but is not what was drawn: {problem}")
+            raise OutputError(f"{self.path} was written but is not what was rendered: {problem}")
 
     def stats(self) -> dict[str, np.ndarray]:
         return image_stats(np.stack(self._samples), 1.0 if self._is_depth else 255.0)

@@ -29,9 +29,9 @@ def recordings(meta: LeRobotDatasetMetadata) -> list[int]:
     Raises:
         DatasetError: the rows hold no recorded numbers, and meta/msdyn does not say where episodes come from.
     """
-    known = provenance_of(meta)
+    provenance = provenance_of(meta)
     marks = [{digest} - {None} for digest in row_digests(meta)]
-    for mark, row in zip(marks, known or [], strict=False):
+    for mark, row in zip(marks, provenance or [], strict=False):
         mark.add(f"{row['source_repo_id']} {row['source_episode']}")
     if not all(marks):
         raise DatasetError(
@@ -75,25 +75,25 @@ def row_digests(meta: LeRobotDatasetMetadata) -> list[str | None]:
     ]
     if not keys:
         return [None] * meta.total_episodes
-    found: list[str | None] = []
+    digests: list[str | None] = []
     for index in range(meta.total_episodes):
         rows = read_rows(meta, index)
         total = hashlib.blake2b(digest_size=DIGEST_BYTES)
         for key in keys:
             total.update(np.ascontiguousarray(values_of(rows, key, meta.features[key])).tobytes())
-        found.append(total.hexdigest())
-    return found
+        digests.append(total.hexdigest())
+    return digests
 
 
 def picture_digests(meta: LeRobotDatasetMetadata) -> list[str]:
     """Per episode a digest of the statistics of its pictures, which LeRobot's tools carry along."""
-    found = []
+    digests = []
     for row in _statistics(meta):
         total = hashlib.blake2b(digest_size=DIGEST_BYTES)
         for name in sorted(row):
             total.update(np.asarray(_flat(row[name]), np.float64).tobytes())
-        found.append(total.hexdigest())
-    return found
+        digests.append(total.hexdigest())
+    return digests
 
 
 def _statistics(meta: LeRobotDatasetMetadata) -> Iterator[dict[str, Any]]:

@@ -35,7 +35,7 @@ class Provenance:
     source_episode: int
     variant: int  # SOURCE_VARIANT for a copy of the source's episode
     seed: int
-    perturbation: dict[str, dict[str, float]] = field(default_factory=dict)  # camera -> what was drawn
+    perturbation: dict[str, dict[str, float]] = field(default_factory=dict)  # camera -> what was sampled
     priors: dict[str, dict[str, dict[str, str]]] = field(
         default_factory=dict
     )  # camera -> prior -> provider, why, model
@@ -83,9 +83,11 @@ def merged(entries: Sequence[dict[str, dict[str, str]]]) -> dict[str, dict[str, 
     names = dict.fromkeys(name for entry in entries for name in entry)
     together: dict[str, dict[str, str]] = {}
     for name in names:
-        found = [entry[name] for entry in entries if name in entry]
-        keys = dict.fromkeys(key for some in found for key in some)
-        together[name] = {key: "; ".join(dict.fromkeys(some[key] for some in found if key in some)) for key in keys}
+        of_windows = [entry[name] for entry in entries if name in entry]
+        keys = dict.fromkeys(key for window in of_windows for key in window)
+        together[name] = {
+            key: "; ".join(dict.fromkeys(window[key] for window in of_windows if key in window)) for key in keys
+        }
     return together
 
 

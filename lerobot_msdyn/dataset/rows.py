@@ -98,6 +98,6 @@ def _rows_problem(rows: pa.Table, meta: LeRobotDatasetMetadata) -> str | None:
     late = np.abs(rows["timestamp"].to_numpy() - np.arange(count) / meta.fps).max()
     if late > TIMESTAMP_TOLERANCE_S:
         return f"timestamps are up to {late:.4f} s from frame_index / fps ({meta.fps} frames per second)"
-    known = set(meta.tasks["task_index"].tolist())
-    unknown = set(pc.unique(rows["task_index"]).to_pylist()) - known
+    listed = set(meta.tasks["task_index"].tolist())
+    unknown = set(pc.unique(rows["task_index"]).to_pylist()) - listed
     return f"task_index is {min(unknown)}; meta/tasks.parquet has no such task" if unknown else None

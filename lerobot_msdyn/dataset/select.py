@@ -35,19 +35,19 @@ def select_cameras(meta: LeRobotDatasetMetadata, cameras: list[str] | None, *, a
     Raises:
         DatasetError: a name is unknown or of a camera on the robot, or no camera is left.
     """
-    known = colour_cameras(meta)
+    colour = colour_cameras(meta)
     if cameras is None:
-        chosen = [key for key in known if allow_moving or not is_wrist_camera(key)]
+        chosen = [key for key in colour if allow_moving or not is_wrist_camera(key)]
         if not chosen:
             raise DatasetError(
-                f"{meta.repo_id}: no camera to re-render; its colour cameras are {', '.join(known) or 'none'}"
+                f"{meta.repo_id}: no camera to re-render; its colour cameras are {', '.join(colour) or 'none'}"
             )
         return chosen
     chosen = []
     for name in cameras:
-        matches = [key for key in known if name in (key, key.rsplit(".", 1)[-1])]
+        matches = [key for key in colour if name in (key, key.rsplit(".", 1)[-1])]
         if not matches:
-            raise DatasetError(f"{meta.repo_id}: no colour camera {name!r}; it has {', '.join(known) or 'none'}")
+            raise DatasetError(f"{meta.repo_id}: no colour camera {name!r}; it has {', '.join(colour) or 'none'}")
         chosen += [key for key in matches if key not in chosen]
     on_robot = [key for key in chosen if is_wrist_camera(key)]
     if on_robot and not allow_moving:

@@ -127,7 +127,7 @@ class Staging(Kept):
     def close(self) -> None:
         """Unlock the folder; it goes if nothing in it is worth keeping."""
         episodes = self.folder / "episodes"
-        if not any(found for name in WORTH_KEEPING for found in episodes.glob(f"*/{name}*.safetensors")):
+        if not any(path for name in WORTH_KEEPING for path in episodes.glob(f"*/{name}*.safetensors")):
             self.remove()
         self._lock.release()
 

@@ -218,7 +218,7 @@ def problem_of(
                 if levels is not None and count < frames:
                     level = float(frame.to_ndarray(format="rgb24").mean())
                     if abs(level - levels[count]) > MAX_LEVEL_ERROR:
-                        return f"frame {count} has brightness {level:.0f}; {levels[count]:.0f} was drawn"
+                        return f"frame {count} has brightness {level:.0f}; {levels[count]:.0f} was given"
                 count += 1
     except VIDEO_ERRORS as error:
         return f"it cannot be decoded after {count} frames ({type(error).__name__})"

@@ -31,7 +31,7 @@ from lerobot_msdyn.dataset.provenance import Provenance, write_provenance, write
 from lerobot_msdyn.dataset.rows import TIMESTAMP_TOLERANCE_S, read_rows, values_of
 from lerobot_msdyn.dataset.staging import FINISHED, SCENE, Kept, Staging
 from lerobot_msdyn.dataset.video import frame_times
-from lerobot_msdyn.scene import store as saved
+from lerobot_msdyn.scene import store
 
 MEGABYTE = 1024**2
 
@@ -95,7 +95,7 @@ class OutputDataset:
     def stage(
         self, index: int, variant: int, frames: Iterable[Mapping[str, np.ndarray]], provenance: Provenance
     ) -> NewEpisode:
-        """Encode the new pictures of one episode as they are drawn (see `stage_pictures`)."""
+        """Encode the new pictures of one episode as they are rendered (see `stage_pictures`)."""
         folder = self.episode(index).folder / f"variant_{variant:02d}"
         length = int(self.source.episodes[index]["length"])
         pictures = stage_pictures(self.source, folder, frames, length, nvenc=self.nvenc)
@@ -130,8 +130,8 @@ class OutputDataset:
             with writing(kept.folder):
                 return stage_copies(self.source, index, self.source.camera_keys, kept.folder / "copied")
 
-        found: StagedPictures = kept.keep("copied", make)
-        return found
+        pictures: StagedPictures = kept.keep("copied", make)
+        return pictures
 
     def finish(
         self,
@@ -161,7 +161,7 @@ class OutputDataset:
                 if episode.masks:
                     write_unseen(folder, number, episode.masks)
             if self.scenes.is_dir():
-                shutil.copytree(self.scenes, folder / saved.FOLDER, copy_function=os.link)
+                shutil.copytree(self.scenes, folder / store.FOLDER, copy_function=os.link)
             write_card(folder, self.repo_id, licence_of(self.source.root))
             report(folder)
             if self.root.exists():

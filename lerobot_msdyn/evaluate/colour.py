@@ -1,6 +1,6 @@
 """Colours of one camera as another one shows them: exposure and white balance differ between cameras.
 
-A gain and an offset per channel that give the drawn pixels the mean and the spread of the true ones. Least squares
+A gain and an offset per channel that give the rendered pixels the mean and the spread of the true ones. Least squares
 would flatter: the less a picture agrees with the true one, the flatter it would be made, and flat pictures score well.
 Mean and spread do not ask which pixel belongs to which.
 """
@@ -27,11 +27,11 @@ class ColourMap:
 
 
 def fit_colours(
-    drawn: UInt8[ndarray, "n h w 3"], true: UInt8[ndarray, "n h w 3"], masks: Bool[ndarray, "n h w"]
+    rendered: UInt8[ndarray, "n h w 3"], true: UInt8[ndarray, "n h w 3"], masks: Bool[ndarray, "n h w"]
 ) -> ColourMap:
-    """The map from the drawn to the true pixels inside the masks; the identity where these hold nothing."""
+    """The map from the rendered to the true pixels inside the masks; the identity where these hold nothing."""
     if not masks.any():
         return ColourMap(np.ones(3), np.zeros(3))
-    a, b = drawn[masks] / LEVELS, true[masks] / LEVELS
+    a, b = rendered[masks] / LEVELS, true[masks] / LEVELS
     gain = b.std(0) / np.maximum(a.std(0), 1 / LEVELS)
     return ColourMap(gain, b.mean(0) - gain * a.mean(0))

@@ -1,4 +1,4 @@
-"""One camera of a calibrated rig is fitted, what another one saw is drawn and compared."""
+"""One camera of a calibrated rig is fitted, what another one saw is rendered and compared."""
 
 from pathlib import Path
 from typing import Any
@@ -42,7 +42,7 @@ Pictures = UInt8[ndarray, "n h w 3"]
 
 
 def evaluate_heldout(config: HeldoutCameraConfig) -> Evaluated:
-    """Fit one camera, draw the view of another to `out`, and score every second frame of it.
+    """Fit one camera, render the view of another to `out`, and score every second frame of it.
 
     The test camera's pictures serve nothing but the comparison: they take no part in depth, and its colours are fitted
     to the other half of the frames. The further cameras that are calibrated help to measure depth, as ever.
@@ -60,10 +60,10 @@ def evaluate_heldout(config: HeldoutCameraConfig) -> Evaluated:
     view, held_out = episode.views[train], episode.views[test]
     scene = timed_reconstruction(seconds, view, config, others=[episode.views[key] for key in helpers])
     with timed(seconds, "render"):
-        drawn, covered = _drawn(scene, held_out.camera, config.out)
+        rendered, covered = _rendered(scene, held_out.camera, config.out)
     with timed(seconds, "baselines"):
         alone = np.stack([picture.rgb for picture in new_pictures(scene.without_overlay(), held_out.camera)])
-        shown = {"this fit": drawn, "this fit without overlay": alone, "recorded picture": _resized(view, held_out)}
+        shown = {"this fit": rendered, "this fit without overlay": alone, "recorded picture": _resized(view, held_out)}
         if scene.metric:
             shown["depth warp"] = _warped(scene, view, held_out.camera)
     with timed(seconds, "score"):
@@ -71,11 +71,11 @@ def evaluate_heldout(config: HeldoutCameraConfig) -> Evaluated:
         covered &= shows_something(held_out.rgb.numpy())
         truth = TrueViews(held_out.rgb.numpy(), np.where(covered, SEEN, NEVER).astype(np.uint8), moving)
         rows = {name: score_half(pictures, truth) for name, pictures in shown.items()}
-        rows["this fit"] |= source_shares(scene, held_out.camera, torch.arange(len(drawn)), truth)
+        rows["this fit"] |= source_shares(scene, held_out.camera, torch.arange(len(rendered)), truth)
     notices = [without_flip(), "" if scene.metric else "no depth warp: the depth is not metric, nor is the fit's place"]
     content: dict[str, Any] = {"train_camera": train, "test_camera": test, "depth_from": helpers, "rows": rows}
     content |= {"what_moves": scene.account.entry()}
-    content |= {"depth": scene.provenance["depth"], "covered": float(covered.mean()), "pictures": len(drawn)}
+    content |= {"depth": scene.provenance["depth"], "covered": float(covered.mean()), "pictures": len(rendered)}
     content |= {"seconds": seconds, "notices": [notice for notice in notices if notice]}
     table = score_table(rows, f"{train} -> {test}, {100 * covered.mean():.0f} % covered")
     return Evaluated(content, table, config.out).written()
@@ -102,7 +102,7 @@ def _check_calibrated(episode: Episode, train: str, test: str, config: HeldoutCa
             )
 
 
-def _drawn(scene: Reconstruction, camera: CameraTrack, out: Path) -> tuple[Pictures, Bool[ndarray, "n h w"]]:
+def _rendered(scene: Reconstruction, camera: CameraTrack, out: Path) -> tuple[Pictures, Bool[ndarray, "n h w"]]:
     """The scene through the held-out camera, written to `out`, and where the fitted camera has seen it."""
     out.mkdir(parents=True, exist_ok=True)
     pictures, covered = [], []
@@ -127,15 +127,15 @@ def _resized(view: View, like: View) -> Pictures:
 
 def _warped(scene: Reconstruction, view: View, camera: CameraTrack) -> Pictures:
     """The recorded pictures through the held-out camera, by the depth that the scene has there."""
-    found = []
+    pictures = []
     for frame, picture in enumerate(new_pictures(scene, scene.camera)):
         recorded, place = scene.camera.select([frame]), camera.select([frame])
-        found.append(warped(view.rgb[frame].numpy(), picture.depth, recorded, place))
-    return np.stack(found)
+        pictures.append(warped(view.rgb[frame].numpy(), picture.depth, recorded, place))
+    return np.stack(pictures)
 
 
-def score_half(drawn: Pictures, truth: TrueViews) -> Scores:
+def score_half(rendered: Pictures, truth: TrueViews) -> Scores:
     """Scores of the one half of the frames, in colours fitted to the other half."""
-    colours = fit_colours(drawn[FIT], truth.rgb[FIT], truth.seen[FIT] != NEVER)
+    colours = fit_colours(rendered[FIT], truth.rgb[FIT], truth.seen[FIT] != NEVER)
     scored = TrueViews(truth.rgb[SCORED], truth.seen[SCORED], None if truth.moving is None else truth.moving[SCORED])
-    return score_views(colours.apply(drawn[SCORED]), scored)
+    return score_views(colours.apply(rendered[SCORED]), scored)

@@ -24,21 +24,21 @@ def quantised(rgb: Float[ndarray, "*t h w 3"]) -> UInt8[ndarray, "*t h w 3"]:
     return (rgb.clip(0, 1) * LEVELS).astype(np.uint8)
 
 
-def masked_psnr_db(drawn: Picture, true: Picture, mask: Mask) -> float:
+def masked_psnr_db(rendered: Picture, true: Picture, mask: Mask) -> float:
     """Peak signal-to-noise ratio (dB) over the mask (mPSNR); infinite where nothing differs or the mask is empty."""
     weight = mask.astype(np.float64)[..., None]
-    error = weight * (_unit(drawn) - _unit(true)) ** 2
+    error = weight * (_unit(rendered) - _unit(true)) ** 2
     mean = error.sum() / max(3 * weight.sum(), 1e-6)
     return float(-10 * np.log10(mean)) if mean > 0 else float("inf")
 
 
-def partial_ssim(drawn: Picture, true: Picture, mask: Mask) -> float:
+def partial_ssim(rendered: Picture, true: Picture, mask: Mask) -> float:
     """DyCheck's mSSIM: partial convolutions along rows, then columns; the mean over all pixels of the map.
 
     The map has no borders ("valid"). Windows without any mask count 1, so the value rises with what the mask leaves
     out: it is comparable only under the same masks.
     """
-    a, b, weight = _unit(drawn), _unit(true), mask.astype(np.float64)
+    a, b, weight = _unit(rendered), _unit(true), mask.astype(np.float64)
     mean_a, mean_b = _partial(a, weight), _partial(b, weight)
     var_a = np.maximum(_partial(a * a, weight) - mean_a * mean_a, 0)
     var_b = np.maximum(_partial(b * b, weight) - mean_b * mean_b, 0)
@@ -47,9 +47,9 @@ def partial_ssim(drawn: Picture, true: Picture, mask: Mask) -> float:
     return float(_similarity(mean_a, mean_b, var_a, var_b, covariance).mean())
 
 
-def inside_ssim(drawn: Picture, true: Picture, mask: Bool[ndarray, "h w"]) -> float:
+def inside_ssim(rendered: Picture, true: Picture, mask: Bool[ndarray, "h w"]) -> float:
     """Structural similarity with moments over the mask alone, averaged inside it; the mask must not be empty."""
-    a, b, weight = _unit(drawn), _unit(true), mask.astype(np.float64)
+    a, b, weight = _unit(rendered), _unit(true), mask.astype(np.float64)
     share = np.maximum(_blurred(weight), 1e-4)[..., None]
 
     def mean(values: Map) -> Map:
@@ -61,16 +61,18 @@ def inside_ssim(drawn: Picture, true: Picture, mask: Bool[ndarray, "h w"]) -> fl
     return float(_similarity(mean_a, mean_b, var_a, var_b, mean(a * b) - mean_a * mean_b)[mask].mean())
 
 
-def flicker(drawn: UInt8[ndarray, "t h w 3"], true: UInt8[ndarray, "t h w 3"], masks: Bool[ndarray, "t h w"]) -> float:
+def flicker(
+    rendered: UInt8[ndarray, "t h w 3"], true: UInt8[ndarray, "t h w 3"], masks: Bool[ndarray, "t h w"]
+) -> float:
     """How much pictures of a camera that stands still change from one to the next beyond what truly changes.
 
-    Mean absolute difference, in levels of 0..255, between the drawn change and the true one, over pixels that are
+    Mean absolute difference, in levels of 0..255, between the rendered change and the true one, over pixels that are
     inside the mask at both times; NaN where there are none.
     """
     both = masks[1:] & masks[:-1]
     if not both.any():
         return float("nan")
-    wrong = drawn.astype(np.int16) - true
+    wrong = rendered.astype(np.int16) - true
     return float(np.abs(np.diff(wrong, axis=0))[both].mean())
 
 
@@ -98,8 +100,8 @@ def _partial(values: Map, weight: Float[ndarray, "h w"]) -> Float[ndarray, "H W 
         ((one, kernel), (one, np.ones(WINDOW)), np.s_[edge:-edge, :]),
     ):
         total = cv2.sepFilter2D(weight, cv2.CV_64F, *ones)[inside][..., None]
-        found = cv2.sepFilter2D(values * weight[..., None], cv2.CV_64F, *taps)[inside]
-        values = np.where(total > 0, found * WINDOW / np.maximum(total, 1e-12), 0)
+        weighted = cv2.sepFilter2D(values * weight[..., None], cv2.CV_64F, *taps)[inside]
+        values = np.where(total > 0, weighted * WINDOW / np.maximum(total, 1e-12), 0)
         weight = (total[..., 0] > 0).astype(np.float64)
     return values
 

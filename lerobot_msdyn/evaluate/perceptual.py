@@ -28,16 +28,16 @@ def without_flip() -> str:
     return "" if has_library("flip_evaluator") else f"FLIP is left out: flip-evaluator is not installed; {INSTALL}"
 
 
-def masked_flip(drawn: UInt8[ndarray, "h w 3"], true: UInt8[ndarray, "h w 3"], mask: Bool[ndarray, "h w"]) -> float:
+def masked_flip(rendered: UInt8[ndarray, "h w 3"], true: UInt8[ndarray, "h w 3"], mask: Bool[ndarray, "h w"]) -> float:
     """Mean FLIP over the mask, 0 (the same) .. 1, at the library's default of 67 pixels per degree.
 
     Pixels beside the mask count as well, as far as the eye's filters reach.
     """
     from flip_evaluator import evaluate
 
-    images = (picture.astype(np.float32) / 255 for picture in (true, drawn))
-    found, _, _ = evaluate(*images, "LDR", applyMagma=False, computeMeanError=False)
-    return float(found[..., 0][mask].mean())
+    images = (picture.astype(np.float32) / 255 for picture in (true, rendered))
+    error, _, _ = evaluate(*images, "LDR", applyMagma=False, computeMeanError=False)
+    return float(error[..., 0][mask].mean())
 
 
 def without_lpips() -> str:
@@ -58,14 +58,14 @@ def lpips_network() -> SpatialNetwork:
 
 
 def masked_lpips(
-    drawn: UInt8[ndarray, "h w 3"],
+    rendered: UInt8[ndarray, "h w 3"],
     true: UInt8[ndarray, "h w 3"],
     mask: Bool[ndarray, "h w"] | Float[ndarray, "h w"],
     network: SpatialNetwork,
 ) -> float:
     """DyCheck's mLPIPS: pictures times the mask, as -1..1; the map's mean over the mask, 0 where that is empty."""
     weight = torch.from_numpy(mask.astype(np.float32))
-    inputs = (2 * weight * torch.from_numpy(picture).movedim(-1, 0)[None] / 255 - 1 for picture in (drawn, true))
+    inputs = (2 * weight * torch.from_numpy(picture).movedim(-1, 0)[None] / 255 - 1 for picture in (rendered, true))
     with torch.no_grad():
-        found = network(*inputs)[0, 0]
-    return float((found * weight).sum() / weight.sum().clamp(min=1e-6))
+        distance = network(*inputs)[0, 0]
+    return float((distance * weight).sum() / weight.sum().clamp(min=1e-6))

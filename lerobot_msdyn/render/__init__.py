@@ -1,4 +1,4 @@
-"""Drawing Gaussians: one interface, several backends that must agree (the reference decides)."""
+"""Rendering Gaussians: one interface, several backends that must agree (the reference decides)."""
 
 from lerobot_msdyn.render.backends import rasterize
 from lerobot_msdyn.render.types import Raster

@@ -1,4 +1,4 @@
-"""Whether gsplat can draw here; if not, what is missing and how to get it, in one line."""
+"""Whether gsplat can render here; if not, what is missing and how to get it, in one line."""
 
 import importlib.metadata
 import importlib.util
@@ -56,14 +56,14 @@ def _missing() -> str:
 
 
 def _failure() -> str:
-    """Draw one Gaussian, by which gsplat compiles its kernels where it has not yet."""
+    """Render one Gaussian, by which gsplat compiles its kernels where it has not yet."""
     version = importlib.metadata.version("gsplat")
     _log.info("loading gsplat %s; its kernels are compiled once, which takes minutes", version)
     try:
-        from lerobot_msdyn.render.cuda import draw_with_gsplat
+        from lerobot_msdyn.render.cuda import render_with_gsplat
 
         one, eye = torch.ones(1, 4, device="cuda"), torch.eye(4, device="cuda")[None]
-        raster = draw_with_gsplat(one[:, :3], one, one[:, :3], 0.5 * one[:, 0], one, eye, eye[:, :3, :3], 8, 8, 0.01)
+        raster = render_with_gsplat(one[:, :3], one, one[:, :3], 0.5 * one[:, 0], one, eye, eye[:, :3, :3], 8, 8, 0.01)
         raster.alpha.sum().item()
     except _FAILURES as error:
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]

@@ -33,7 +33,7 @@ def rasterize(
     backend: str = "auto",
     near: float = 0.01,
 ) -> Raster:
-    """Draw Gaussians into a batch of views, differentiably in everything but the intrinsics.
+    """Render Gaussians into a batch of views, differentiably in everything but the intrinsics.
 
     Gaussian tensors are shared by all views, or hold one set per view (a leading `b`), each independently.
 
@@ -49,7 +49,7 @@ def rasterize(
         height: of the images, px.
         backend: "reference" (torch), "cpu" (numba), "cuda" (gsplat) or "auto": the fastest one that is
             available on the device of `means`.
-        near: Gaussians whose centre is at this z-depth (m) or nearer are not drawn; above 0.
+        near: Gaussians whose centre is at this z-depth (m) or nearer are not rendered; above 0.
 
     Raises:
         RenderError: a tensor has a wrong shape, dtype, device or value, or the backend cannot be used.
@@ -68,10 +68,10 @@ def rasterize(
         raise RenderError(f"backend is {backend!r}; expected one of {', '.join(BACKENDS)}")
     if backend == "auto":
         backend = _best_backend(means, features)
-    draw, problem = _load(backend)
-    if draw is None:
+    implementation, problem = _load(backend)
+    if implementation is None:
         raise RenderError(f"backend {backend!r} cannot be used: {problem}; use backend='reference'")
-    return draw(means, quats, scales, opacities, features, camera_from_world, intrinsics, width, height, near)
+    return implementation(means, quats, scales, opacities, features, camera_from_world, intrinsics, width, height, near)
 
 
 def _best_backend(means: Tensor, features: Tensor) -> str:
@@ -80,8 +80,8 @@ def _best_backend(means: Tensor, features: Tensor) -> str:
     limits = {"cpu": MAX_CPU_CHANNELS, "cuda": features.shape[-1]}
     if means.dtype != torch.float32 or features.shape[-1] > limits.get(backend, -1):
         return "reference"
-    draw, problem = _load(backend)
-    if draw is None:
+    implementation, problem = _load(backend)
+    if implementation is None:
         _warn_once(backend, problem)
         return "reference"
     return backend

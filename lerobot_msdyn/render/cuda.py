@@ -7,7 +7,7 @@ from torch import Tensor
 
 from lerobot_msdyn.core.errors import RenderError
 from lerobot_msdyn.core.geometry import transform_points
-from lerobot_msdyn.render.reference import drawable, rasterize_reference
+from lerobot_msdyn.render.reference import rasterize_reference, renderable
 from lerobot_msdyn.render.types import COVARIANCE_BLUR, QUAT_LENGTHS, Raster
 from lerobot_msdyn.render.validation import check_values
 
@@ -24,7 +24,7 @@ def rasterize_cuda(
     height: int,
     near: float,
 ) -> Raster:
-    """Draw Gaussians in float32 with gsplat's kernels; arguments as in `rasterize`.
+    """Render Gaussians in float32 with gsplat's kernels; arguments as in `rasterize`.
 
     Raises:
         RenderError: tensors are not float32 on a CUDA device, or a value is not finite or out of range.
@@ -38,7 +38,7 @@ def rasterize_cuda(
     if means.shape[-2] == 0:  # gsplat takes no empty scene
         return rasterize_reference(*tensors, width, height, near)
     usable = _usable(*tensors)
-    raster = draw_with_gsplat(*tensors, width, height, near)
+    raster = render_with_gsplat(*tensors, width, height, near)
     if not usable:  # read only now: gsplat has waited for the device already
         check_values(
             {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "features": features},
@@ -47,7 +47,7 @@ def rasterize_cuda(
     return raster
 
 
-def draw_with_gsplat(
+def render_with_gsplat(
     means: Float[Tensor, "*#views g 3"],
     quats: Float[Tensor, "*#views g 4"],
     scales: Float[Tensor, "*#views g 3"],
@@ -62,7 +62,7 @@ def draw_with_gsplat(
     """The same, unchecked, of one Gaussian or more.
 
     gsplat takes either one scene for all views or one for each, not a mix: all tensors are given per view. What the
-    reference does not draw gets an opacity of zero, by which gsplat leaves it out as well.
+    reference does not render gets an opacity of zero, by which gsplat leaves it out as well.
     """
     views = len(camera_from_world)
     means, quats, scales, opacities, features = (
@@ -70,7 +70,7 @@ def draw_with_gsplat(
         for values, rank in ((means, 2), (quats, 2), (scales, 2), (opacities, 1), (features, 2))
     )
     with torch.no_grad():
-        shown = drawable(transform_points(camera_from_world, means), scales, opacities, intrinsics, near)
+        shown = renderable(transform_points(camera_from_world, means), scales, opacities, intrinsics, near)
     images, alpha, _ = rasterization(
         means,
         quats,

@@ -63,7 +63,7 @@ def rasterize_reference(
     height: int,
     near: float,
 ) -> Raster:
-    """Draw Gaussians in float32 or float64 on any device; arguments as in `rasterize`.
+    """Render Gaussians in float32 or float64 on any device; arguments as in `rasterize`.
 
     Raises:
         RenderError: a value is not finite or out of range.
@@ -97,7 +97,7 @@ def _project(
     rotation = camera_from_world[:, :3, :3]
     in_camera = means @ rotation.transpose(-1, -2) + camera_from_world[:, None, :3, 3]
     views, count = in_camera.shape[:2]
-    view, gaussian = drawable(in_camera, scales, opacities, intrinsics, near).nonzero(as_tuple=True)
+    view, gaussian = renderable(in_camera, scales, opacities, intrinsics, near).nonzero(as_tuple=True)
     pair = view * count + gaussian
 
     def rows(values: Tensor, ndim: int) -> Tensor:
@@ -125,14 +125,14 @@ def _project(
     )
 
 
-def drawable(
+def renderable(
     in_camera: Float[Tensor, "b g 3"],
     scales: Float[Tensor, "*#views g 3"],
     opacities: Float[Tensor, "*#views g"],
     intrinsics: Float[Tensor, "b 3 3"],
     near: float,
 ) -> Bool[Tensor, "b g"]:
-    """Which Gaussians are drawn, by their centres in the cameras (m): beyond the near plane, seen, not too large."""
+    """Which Gaussians are rendered, by their centres in the cameras (m): beyond the near plane, seen, not too large."""
     z = in_camera[..., 2]
     focal = intrinsics.diagonal(dim1=-2, dim2=-1)[:, :2].amax(1, keepdim=True)
     largest = torch.cat((in_camera[..., :2].abs(), scales.expand_as(in_camera)), dim=2).amax(2)
@@ -190,7 +190,7 @@ def _composite(
     conic = conic / splats.determinant[:, None]
     table = torch.cat((splats.center, conic, splats.opacity.log()[:, None], values), dim=1)
     start = torch.cumsum(lists.count, 0) - lists.count
-    blended, drawn = [], []
+    blended, blended_tiles = [], []
     for tiles, longest in _batches(lists.count):
         nth = torch.arange(longest, device=tiles.device)
         real = nth < lists.count[tiles][:, None]
@@ -198,10 +198,10 @@ def _composite(
         rows = table.index_select(0, lists.row[position].reshape(-1)).reshape(len(tiles), longest, -1)
         weights = _weights(rows[..., :6], real, _tile_origin(tiles, lists).to(table.dtype))
         blended.append(weights.transpose(1, 2) @ rows[..., 6:])
-        drawn.append(tiles)
+        blended_tiles.append(tiles)
     image = values.new_zeros(views * lists.across * lists.down, TILE * TILE, values.shape[1])
-    if drawn:
-        image = image.index_copy(0, torch.cat(drawn), torch.cat(blended))
+    if blended_tiles:
+        image = image.index_copy(0, torch.cat(blended_tiles), torch.cat(blended))
     image = image.reshape(views, lists.down, lists.across, TILE, TILE, -1).transpose(2, 3)
     return image.reshape(views, lists.down * TILE, lists.across * TILE, -1)[:, :height, :width]
 

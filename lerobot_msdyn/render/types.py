@@ -11,7 +11,7 @@ MAX_ALPHA = 0.999  # cap on the alpha of one Gaussian at one pixel; no gradient 
 MIN_TRANSMITTANCE = 1e-4  # a pixel is finished before the Gaussian that would take it to this or less
 TANGENT_MARGIN = 0.3  # of half the image's field of view: how far outside the perspective is linearised
 MAX_CPU_CHANNELS = 16  # feature channels of one call of the CPU backend
-FURTHEST = 1e9  # px; a Gaussian further off or with larger sigmas is not drawn (float32 ends there)
+FURTHEST = 1e9  # px; a Gaussian further off or with larger sigmas is not rendered (float32 ends there)
 QUAT_LENGTHS = (1e-12, 1e12)  # lengths that a quaternion may have: their squares are ordinary float32 numbers
 
 

@@ -1,4 +1,4 @@
-"""Refuses what cannot be drawn, naming the tensor and the first bad place."""
+"""Refuses what cannot be rendered, naming the tensor and the first bad place."""
 
 import torch
 from torch import Tensor
@@ -58,7 +58,7 @@ def check_shapes(gaussians: dict[str, Tensor], cameras: dict[str, Tensor], width
 
 
 def check_values(gaussians: dict[str, Tensor], cameras: dict[str, Tensor]) -> None:
-    """Check that every number can be drawn: finite, opacities in 0..1, scales not negative, quats not zero.
+    """Check that every number can be rendered: finite, opacities in 0..1, scales not negative, quats not zero.
 
     Raises:
         RenderError: names the tensor, the index of the first bad entry, its value and what was expected.

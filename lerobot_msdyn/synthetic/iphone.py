@@ -53,11 +53,11 @@ def write_iphone_folder(scene: SyntheticScene, root: Path, every: int = 5, sway_
         for i, name in enumerate(sight.names):
             _write_json(root / "camera" / f"{name}.json", _camera(sight.camera, i))
     _write_colmap(root / PROCESSED / "colmap", sights)
-    for split, some in (("train", sights[:1]), ("val", sights[1:])):
+    for split, in_split in (("train", sights[:1]), ("val", sights[1:])):
         content = {
-            "frame_names": [name for sight in some for name in sight.names],
-            "time_ids": [frame for sight in some for frame in sight.frames],
-            "camera_ids": [sight.number for sight in some for _ in sight.frames],
+            "frame_names": [name for sight in in_split for name in sight.names],
+            "time_ids": [frame for sight in in_split for frame in sight.frames],
+            "camera_ids": [sight.number for sight in in_split for _ in sight.frames],
         }
         _write_json(root / "splits" / f"{split}.json", content)
     _write_json(root / "extra.json", {"factor": 2, "fps": scene.fps})

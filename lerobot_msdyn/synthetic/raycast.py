@@ -60,7 +60,7 @@ class Pinhole(NamedTuple):
 class Cache(NamedTuple):
     """Lists of primitives that neighbouring pixels share."""
 
-    drawn: np.ndarray  # [P] those that the tile's rays may meet
+    candidates: np.ndarray  # [P] those that the tile's rays may meet
     casters: np.ndarray  # [P] those that may shade points near the anchor
     counts: np.ndarray  # [2] how many are in either list
     anchor: np.ndarray  # [3] m
@@ -198,7 +198,7 @@ def _pixel_light(geometry: Geometry, look: Appearance, camera: Pinhole, x: int, 
     received = (0.0, 0.0, 0.0, 0.0)
     for sample in range(4):
         ray = _ray(camera, x + 0.25 + 0.5 * (sample % 2), y + 0.25 + 0.5 * (sample // 2))
-        depth, p = nearest(geometry, cache.drawn, cache.counts[0], eye, ray)
+        depth, p = nearest(geometry, cache.candidates, cache.counts[0], eye, ray)
         if p < 0:
             continue
         local, point = local_point(geometry, p, eye, ray, depth), along(eye, ray, depth)
@@ -231,7 +231,7 @@ def trace_color(geometry: Geometry, look: Appearance, camera: Pinhole, rgb: np.n
     cache = Cache(np.empty(size, np.int64), np.empty(size, np.int64), np.zeros(2, np.int64), np.full(3, 1e9))
     for y0 in range(0, height, TILE):
         for x0 in range(0, width, TILE):
-            cache.counts[0] = _cull(geometry, camera, x0, y0, cache.drawn)
+            cache.counts[0] = _cull(geometry, camera, x0, y0, cache.candidates)
             for y in range(y0, min(y0 + TILE, height)):
                 for x in range(x0, min(x0 + TILE, width)):
                     light = _pixel_light(geometry, look, camera, x, y, cache)

@@ -109,10 +109,10 @@ class SyntheticScene:
         surface = self.surface(camera, frames)
         rgb = np.zeros((*surface.depth.shape, 3), np.uint8)
 
-        def draw(geometry: Geometry, pinhole: Pinhole, i: int) -> None:
+        def trace(geometry: Geometry, pinhole: Pinhole, i: int) -> None:
             trace_color(geometry, self.look, pinhole, rgb[i])
 
-        self._each_frame(camera, frames, draw)
+        self._each_frame(camera, frames, trace)
         # index -1 (no surface) reads the last entry
         instances = np.append(self.instance_of_primitive, 0)[surface.primitive].astype(np.uint8)
         return SyntheticView(torch.from_numpy(rgb), torch.from_numpy(surface.depth), torch.from_numpy(instances))

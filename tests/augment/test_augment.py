@@ -42,9 +42,9 @@ def test_output_is_the_source_seen_from_elsewhere(desk: Path, augmented: Path) -
             assert a["task"] == b["task"]
             changed.append(float((a[FRONT] - b[FRONT]).abs().mean()))
             assert torch.equal(a[f"{FRONT}_depth"], b[f"{FRONT}_depth"]) == (number % 3 == 0), (number, i)
-            known = b[f"{FRONT}_depth"] > 15  # mm; missing pixels come back as 10
-            assert known.float().mean() > 0.5
-            assert 300 < b[f"{FRONT}_depth"][known].median() < 3000
+            measured = b[f"{FRONT}_depth"] > 15  # mm; missing pixels come back as 10
+            assert measured.float().mean() > 0.5
+            assert 300 < b[f"{FRONT}_depth"][measured].median() < 3000
             position += 1
         if number % 3 == 0:
             assert max(changed) == 0
@@ -59,8 +59,8 @@ def test_variants_differ_and_episodes_say_where_they_come_from(augmented: Path) 
     assert not torch.equal(output[starts[1]][FRONT], output[starts[2]][FRONT])
     rows = pq.read_table(augmented / "meta" / "msdyn" / "episodes.parquet").to_pylist()
     assert [(row["source_episode"], row["variant"]) for row in rows] == [(e, v) for e in (0, 2) for v in (-1, 0, 1)]
-    drawn = json.loads(rows[1]["perturbation"])[FRONT]
-    assert abs(drawn["azimuth_deg"]) <= 10
+    sampled = json.loads(rows[1]["perturbation"])[FRONT]
+    assert abs(sampled["azimuth_deg"]) <= 10
 
 
 def test_the_same_command_gives_the_same_pictures(desk: Path, augmented: Path, tmp_path: Path) -> None:
@@ -77,9 +77,9 @@ def test_the_same_command_gives_the_same_pictures(desk: Path, augmented: Path, t
 
 def test_dry_run_writes_nothing(desk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("--repo", "local/desk", "--root", str(desk), "--new_root", str(tmp_path / "new"), "--dry_run") == 0
-    said = capsys.readouterr().out
-    assert "3 episodes, 36 frames" in said
-    assert "2 new per episode: 9 episodes, 108 frames, 144 new pictures" in said
+    printed = capsys.readouterr().out
+    assert "3 episodes, 36 frames" in printed
+    assert "2 new per episode: 9 episodes, 108 frames, 144 new pictures" in printed
     assert list(tmp_path.iterdir()) == []
 
 
@@ -114,11 +114,11 @@ def test_bad_input_is_one_line_and_exit_code_2(desk: Path, tmp_path: Path, capsy
     ]
     for arguments, message in cases:
         assert run(*arguments) == 2, arguments
-        said = capsys.readouterr().err
-        errors = [line for line in said.splitlines() if line.startswith("error: ")]
-        assert len(errors) == 1, said
+        printed = capsys.readouterr().err
+        errors = [line for line in printed.splitlines() if line.startswith("error: ")]
+        assert len(errors) == 1, printed
         assert message in errors[0]
-        assert "Traceback" not in said
+        assert "Traceback" not in printed
         assert not (tmp_path / "new").exists()
     assert not any(path.name.endswith(".partial") for path in tmp_path.iterdir())
 
@@ -128,9 +128,9 @@ def test_a_truncated_video_costs_its_episode_only(
 ) -> None:
     arguments = ["--repo", "local/desk", "--root", str(half_broken_desk), "--new_root", str(tmp_path / "new")]
     assert run(*arguments, "--variants", "1", *FAST) == 1
-    said = capsys.readouterr().out
-    assert "1 of 2 episodes, 1 new ones" in said
-    assert "skipped: local/desk episode 1, observation.images.front" in said
+    printed = capsys.readouterr().out
+    assert "1 of 2 episodes, 1 new ones" in printed
+    assert "skipped: local/desk episode 1, observation.images.front" in printed
     output = LeRobotDataset("local/desk_msdyn", root=tmp_path / "new", video_backend="pyav")
     assert output.num_episodes == 2
     assert np.isfinite([float(output[i][FRONT].mean()) for i in range(len(output))]).all()
@@ -157,16 +157,16 @@ def half_broken_desk(desk: Path, tmp_path: Path) -> Path:
 def test_a_fault_in_one_episode_does_not_cost_the_others(
     desk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from lerobot_msdyn.augment import run as engines
+    from lerobot_msdyn.augment import run as job
 
-    whole = engines.augment_episode
+    whole = job.augment_episode
 
     def faulty(source: Any, index: int, *rest: Any) -> object:
         if index == 0:
             raise RuntimeError("a fault")
         return whole(source, index, *rest)
 
-    monkeypatch.setattr(engines, "augment_episode", faulty)
+    monkeypatch.setattr(job, "augment_episode", faulty)
     arguments = ["--repo", "local/desk", "--root", str(desk), "--new_root", str(tmp_path / "new")]
     assert run(*arguments, "--episodes", "[0,1]", "--cameras", "[front]", "--variants", "1", *FAST) == 1
     assert "skipped: local/desk episode 0: RuntimeError: a fault" in capsys.readouterr().out
@@ -181,9 +181,9 @@ def content(root: Path) -> dict[Path, bytes]:
 def test_a_run_that_was_stopped_goes_on_and_gives_the_same_files(
     desk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from lerobot_msdyn.augment import run as engines
+    from lerobot_msdyn.augment import run as job
 
-    whole = engines.augment_episode
+    whole = job.augment_episode
     begun: list[int] = []
 
     def stopped(source: Any, index: int, *rest: Any) -> object:
@@ -194,13 +194,13 @@ def test_a_run_that_was_stopped_goes_on_and_gives_the_same_files(
 
     arguments = ["--repo", "local/desk", "--root", str(desk), "--episodes", "[0,2]", "--cameras", "[front]"]
     arguments += ["--variants", "1", *FAST, "--new_repo_id", "local/new"]
-    monkeypatch.setattr(engines, "augment_episode", stopped)
+    monkeypatch.setattr(job, "augment_episode", stopped)
     assert run(*arguments, "--new_root", str(tmp_path / "new")) == 130
     assert "interrupted: 1 episodes are finished and kept in" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
     assert run(*arguments, "--new_root", str(tmp_path / "new"), "--fit.steps", "9") == 2
     assert "started differently: fit.steps was 8, is 9. Start it as before" in capsys.readouterr().err
-    monkeypatch.setattr(engines, "augment_episode", whole)
+    monkeypatch.setattr(job, "augment_episode", whole)
     assert run(*arguments, "--new_root", str(tmp_path / "new")) == 0
     assert run(*arguments, "--new_root", str(tmp_path / "whole")) == 0
     first, second = (
@@ -230,10 +230,10 @@ def test_states_that_are_no_numbers_cost_their_episode_only(
     pq.write_table(table.set_column(position, field, pa.array(states, field.type)), path)
     arguments = ["--repo", "local/desk", "--root", str(root), "--new_root", str(tmp_path / "new")]
     assert run(*arguments, "--episodes", "[0,1]", "--cameras", "[front]", "--variants", "1", *FAST) == 1
-    said = capsys.readouterr().out
-    assert "1 of 2 episodes, 1 new ones" in said
-    assert "skipped: local/desk episode 1: in" in said
-    assert "observation.state is not a number in 1 of 12 rows" in said
+    printed = capsys.readouterr().out
+    assert "1 of 2 episodes, 1 new ones" in printed
+    assert "skipped: local/desk episode 1: in" in printed
+    assert "observation.state is not a number in 1 of 12 rows" in printed
 
 
 def test_as_a_module() -> None:

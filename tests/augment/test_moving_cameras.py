@@ -24,7 +24,7 @@ def episode(shift: torch.Tensor, state: torch.Tensor | None) -> Episode:
     picture = texture.to(torch.uint8).repeat_interleave(4, 0).repeat_interleave(4, 1)
     rgb = torch.stack([picture.roll(int(x), dims=1) for x in shift])
     camera = static_camera(intrinsics_from_fov(WIDTH, HEIGHT, 60.0), FRAMES, WIDTH, HEIGHT)
-    source = EpisodeSource("local/made_up", Path(), 0)
+    source = EpisodeSource("local/synthetic", Path(), 0)
     return Episode(source, 30, torch.arange(FRAMES) / 30, {"top": View(rgb, camera)}, state, None, "")
 
 
@@ -36,10 +36,10 @@ def stop_and_go() -> torch.Tensor:
 
 def test_a_camera_on_the_arm_moves_when_the_state_does() -> None:
     path = stop_and_go()
-    found = episode(path.round(), path[:, None])
-    assert found.state is not None
-    assert correlation(found.state, found.views["top"].rgb) > 0.8
-    assert "with the robot" in why_moving(found, "top")
+    on_arm = episode(path.round(), path[:, None])
+    assert on_arm.state is not None
+    assert correlation(on_arm.state, on_arm.views["top"].rgb) > 0.8
+    assert "with the robot" in why_moving(on_arm, "top")
     assert "no state" in why_moving(episode(path.round(), None), "top")
 
 

@@ -5,7 +5,7 @@ from unittest.mock import Mock
 import pytest
 import torch
 
-from lerobot_msdyn.augment import run as engines
+from lerobot_msdyn.augment import run as job
 from lerobot_msdyn.augment import workers
 from lerobot_msdyn.augment.config import AugmentConfig
 
@@ -23,7 +23,7 @@ def test_workers_share_the_memory_of_a_gpu(monkeypatch: pytest.MonkeyPatch, devi
 def test_a_full_gpu_costs_its_episode(monkeypatch: pytest.MonkeyPatch) -> None:
     work = Mock(spec=workers.Work, source=Mock(repo_id="local/desk"), output=Mock())
     work.output.finish_episode.side_effect = torch.OutOfMemoryError("CUDA out of memory")
-    monkeypatch.setattr(engines, "_make", lambda work, index: None)
-    found = engines.attempt(work, 3)
-    assert found is not None
-    assert found.startswith("local/desk episode 3: the memory of the GPU is full; try fewer --workers")
+    monkeypatch.setattr(job, "_make", lambda work, index: None)
+    reason = job.attempt(work, 3)
+    assert reason is not None
+    assert reason.startswith("local/desk episode 3: the memory of the GPU is full; try fewer --workers")

@@ -51,14 +51,14 @@ def files(root: Path) -> list[Path]:
 
 def workers_writing_to(log: Path) -> list[int]:
     """Started processes whose standard output is that of the run."""
-    found = []
+    workers = []
     for process in Path("/proc").glob("[0-9]*"):
         try:
             if (process / "fd" / "1").readlink() == log and b"spawn_main" in (process / "cmdline").read_bytes():
-                found.append(int(process.name))
+                workers.append(int(process.name))
         except OSError:
             continue
-    return found
+    return workers
 
 
 def test_how_many() -> None:
@@ -173,12 +173,12 @@ def test_all_processes_end_where_one_is_killed(desk: Path, tmp_path: Path, kille
         assert run.poll() is None
         time.sleep(0.1)
     os.kill(run.pid if killed == "parent" else workers_writing_to(log)[0], signal.SIGKILL)
-    said = run.communicate(timeout=60)[1].splitlines()
+    errors = run.communicate(timeout=60)[1].splitlines()
     if killed == "parent":
         assert run.returncode == -signal.SIGKILL
     else:
         assert run.returncode == 2
-        assert "error: one of 2 worker processes ended unexpectedly" in said[-1]
+        assert "error: one of 2 worker processes ended unexpectedly" in errors[-1]
     while workers_writing_to(log):
         assert time.monotonic() < deadline
         time.sleep(0.1)

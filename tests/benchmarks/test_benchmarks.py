@@ -131,7 +131,7 @@ def test_the_gpu_benchmark_runs_on_the_cpu(
     assert all(row["pixels off"] < 1e-3 for row in rows if row["part"] == "parity")
     said = capsys.readouterr().out
     assert "augment ended with" not in said
-    assert "frames per s, drawn alone" in said
+    assert "frames per s, rendered alone" in said
 
 
 @pytest.fixture

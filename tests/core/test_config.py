@@ -40,12 +40,12 @@ def test_defaults() -> None:
 def test_flags_override_the_recipe_and_the_recipe_the_defaults(tmp_path: Path) -> None:
     recipe = tmp_path / "mine.yaml"
     recipe.write_text("variants: 5\nfit: {steps: 7, max_width: 64}\n")
-    found = parse("--repo", "local/ds", "--recipe", str(recipe), "--fit.steps=9", "--episodes", "[0,3]")
-    assert found.repo_id == "local/ds"
-    assert found.variants == 5
-    assert (found.fit.steps, found.fit.max_width) == (9, 64)
-    assert found.fit.weights == AugmentConfig().fit.weights
-    assert found.episodes == [0, 3]
+    config = parse("--repo", "local/ds", "--recipe", str(recipe), "--fit.steps=9", "--episodes", "[0,3]")
+    assert config.repo_id == "local/ds"
+    assert config.variants == 5
+    assert (config.fit.steps, config.fit.max_width) == (9, 64)
+    assert config.fit.weights == AugmentConfig().fit.weights
+    assert config.episodes == [0, 3]
 
 
 def test_order_of_recipe_and_flags_does_not_matter() -> None:
@@ -145,13 +145,13 @@ COMMANDS = {  # what each command line sets
 
 def command_configs() -> dict[str, Any]:
     """By name, every dataclass of the package that is called a Config, wherever it stands, and Recipe."""
-    found: dict[str, Any] = {}
+    classes: dict[str, Any] = {}
     for path in PACKAGE.rglob("*.py"):
         for node in ast.parse(path.read_text()).body:
             if isinstance(node, ast.ClassDef) and (node.name.endswith("Config") or node.name == "Recipe"):
                 module = ".".join(path.relative_to(PROJECT).with_suffix("").parts).removesuffix(".__init__")
-                found[node.name] = getattr(importlib.import_module(module), node.name)
-    return {name: kind for name, kind in found.items() if dataclasses.is_dataclass(kind)}
+                classes[node.name] = getattr(importlib.import_module(module), node.name)
+    return {name: kind for name, kind in classes.items() if dataclasses.is_dataclass(kind)}
 
 
 def with_parts(kind: Any) -> set[type]:

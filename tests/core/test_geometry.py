@@ -79,10 +79,10 @@ def test_procrustes_never_reflects(flat: bool) -> None:
     source = torch.randn(20, 3, generator=torch.Generator().manual_seed(0))
     if flat:
         source[:, 2] = 0
-    found = g.weighted_procrustes(source, source * torch.tensor([1.0, 1, -1]), torch.ones(20))
-    torch.testing.assert_close(torch.linalg.det(found[:3, :3]), torch.tensor(1.0))
+    pose = g.weighted_procrustes(source, source * torch.tensor([1.0, 1, -1]), torch.ones(20))
+    torch.testing.assert_close(torch.linalg.det(pose[:3, :3]), torch.tensor(1.0))
     if flat:
-        torch.testing.assert_close(g.transform_points(found, source), source, atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(g.transform_points(pose, source), source, atol=1e-5, rtol=1e-5)
 
 
 def test_a_quaternion_and_its_conjugate_undo_each_other() -> None:

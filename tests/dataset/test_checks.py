@@ -136,8 +136,8 @@ def test_channels_first_or_last() -> None:
 
 
 def test_templates() -> None:
-    known = {"chunk_index", "file_index"}
-    assert template_problem("data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet", known) is None
+    fields = {"chunk_index", "file_index"}
+    assert template_problem("data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet", fields) is None
     for bad in (
         "",
         3,
@@ -151,12 +151,12 @@ def test_templates() -> None:
         "{chunk_index!s}",
         "a\0b",
     ):
-        assert template_problem(bad, known) is not None, bad
+        assert template_problem(bad, fields) is not None, bad
 
 
 def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    return [found for key, item in items for found in ((*path, key), *places(item, (*path, key)))]
+    return [place for key, item in items for place in ((*path, key), *places(item, (*path, key)))]
 
 
 json_values = st.recursive(
@@ -186,15 +186,15 @@ def assert_refused_or_harmless(root: Path) -> None:
     try:
         source = open_source("local/ds", root)
     except DatasetError as error:
-        said = str(error)
-        assert "\n" not in said
+        message = str(error)
+        assert "\n" not in message
         return
     for index in range(source.total_episodes):
         with pytest.raises(EpisodeError) as caught:  # there is no data/
             read_rows(source, index)
-        said = str(caught.value)
-        assert "\n" not in said
-        if "meta/episodes says that" not in said:
+        message = str(caught.value)
+        assert "\n" not in message
+        if "meta/episodes says that" not in message:
             paths = [source.get_data_file_path(index)]
             paths += [source.get_video_file_path(index, key) for key in source.video_keys]
             assert all((root / path).resolve().is_relative_to(root) for path in paths)

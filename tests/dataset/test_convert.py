@@ -56,8 +56,8 @@ def test_only_lerobot_is_quiet_and_only_while_it_converts(
     with caplog.at_level("INFO"):
         converted_copy("local/a", legacy(tmp_path / "a"), tmp_path / "work")
         logging.getLogger("lerobot.datasets.utils").warning("later")
-    said = [record.getMessage() for record in caplog.records if record.name != convert.__name__]
-    assert said == ["wait", "trouble", "later"]
+    logged = [record.getMessage() for record in caplog.records if record.name != convert.__name__]
+    assert logged == ["wait", "trouble", "later"]
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Pictures are encoded in order, beside what draws them, and a fault on either side ends both."""
+"""Pictures are encoded in order, beside what renders them, and a fault on either side ends both."""
 
 import threading
 from collections.abc import Iterator
@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import pytest
 
 from lerobot_msdyn.core.errors import OutputError
-from lerobot_msdyn.dataset import encode as pictures
+from lerobot_msdyn.dataset import encode
 
 
 def test_work_is_done_in_order_in_another_thread() -> None:
@@ -16,11 +16,11 @@ def test_work_is_done_in_order_in_another_thread() -> None:
         done.append(item)
         threads.add(threading.get_ident())
 
-    assert pictures._meanwhile(work, iter(range(50))) == 50
+    assert encode._meanwhile(work, iter(range(50))) == 50
     assert done == list(range(50))
     assert len(threads) == 1
     assert threads != {threading.get_ident()}
-    assert pictures._meanwhile(work, []) == 0
+    assert encode._meanwhile(work, []) == 0
 
 
 def test_only_so_many_are_made_ahead() -> None:
@@ -30,14 +30,14 @@ def test_only_so_many_are_made_ahead() -> None:
         release.wait(30)
 
     def items() -> Iterator[int]:
-        for item in range(pictures.AHEAD + 5):
+        for item in range(encode.AHEAD + 5):
             made.append(item)
-            if item == pictures.AHEAD:
+            if item == encode.AHEAD:
                 threading.Timer(0.2, release.set).start()
-            assert item <= pictures.AHEAD or release.is_set()
+            assert item <= encode.AHEAD or release.is_set()
             yield item
 
-    assert pictures._meanwhile(wait, items()) == pictures.AHEAD + 5
+    assert encode._meanwhile(wait, items()) == encode.AHEAD + 5
 
 
 def test_a_fault_of_the_work_is_raised() -> None:
@@ -46,10 +46,10 @@ def test_a_fault_of_the_work_is_raised() -> None:
             raise OutputError("the disk is full")
 
     with pytest.raises(OutputError, match="the disk is full"):
-        pictures._meanwhile(work, iter(range(1000)))
+        encode._meanwhile(work, iter(range(1000)))
 
 
-def test_a_fault_of_the_drawing_is_raised_when_the_work_is_done() -> None:
+def test_a_fault_of_the_rendering_is_raised_when_the_work_is_done() -> None:
     done: list[int] = []
 
     def items() -> Iterator[int]:
@@ -57,5 +57,5 @@ def test_a_fault_of_the_drawing_is_raised_when_the_work_is_done() -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        pictures._meanwhile(done.append, items())
+        encode._meanwhile(done.append, items())
     assert done == [1]

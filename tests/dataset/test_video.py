@@ -86,9 +86,9 @@ def test_encoder_is_the_sources() -> None:
 def test_a_gpu_encodes_what_lerobot_has_settings_for(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(video, "_can_encode", lambda name: True)
     given = RGBEncoderConfig(vcodec="h264", crf=18, g=5, preset="slow")
-    found = nvenc_of(given)
-    assert (found.vcodec, found.pix_fmt, found.g) == ("h264_nvenc", given.pix_fmt, 5)
-    assert found.get_codec_options()["qp"] == 18
+    on_gpu = nvenc_of(given)
+    assert (on_gpu.vcodec, on_gpu.pix_fmt, on_gpu.g) == ("h264_nvenc", given.pix_fmt, 5)
+    assert on_gpu.get_codec_options()["qp"] == 18
     for other in (RGBEncoderConfig(vcodec="libsvtav1"), DepthEncoderConfig()):
         assert nvenc_of(other) is other
     monkeypatch.setattr(video, "_can_encode", lambda name: False)

@@ -38,8 +38,8 @@ def write_upside_down(root: Path, out: Path, indices: tuple[int, ...]) -> list[N
         episodes = []
         for index in indices:
             rgb = read_colour(source, index, FRONT, read_rows(source, index)).flip(1).numpy()
-            drawn = Provenance("local/desk", index, 0, 0, {FRONT: {"azimuth_deg": 1.5}})
-            episodes += [copied(index), output.stage(index, 0, ({FRONT: frame} for frame in rgb), drawn)]
+            origin = Provenance("local/desk", index, 0, 0, {FRONT: {"azimuth_deg": 1.5}})
+            episodes += [copied(index), output.stage(index, 0, ({FRONT: frame} for frame in rgb), origin)]
         output.finish(episodes, "variants: 1\n")
     return episodes
 
@@ -162,6 +162,6 @@ def test_an_error_leaves_nothing_behind(desk: Path, tmp_path: Path) -> None:
         with OutputDataset(source, "local/new", tmp_path / "new") as output:
             output.stage(0, 0, [{FRONT: np.zeros((48, 64, 3), np.uint8)}], copied(0).provenance)
 
-    with pytest.raises(OutputError, match="episodes/000000/variant_00: 1 frames were drawn; expected 12"):
+    with pytest.raises(OutputError, match="episodes/000000/variant_00: 1 frames were rendered; expected 12"):
         write()
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""One made-up sequence in both layouts, for several tests."""
+"""One synthetic sequence in both layouts, for several tests."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Sequences from the command line: fitted, drawn and scored by both protocols."""
+"""Sequences from the command line: fitted, rendered and scored by both protocols."""
 
 import importlib
 import json
@@ -26,21 +26,21 @@ def test_the_fit_beats_the_recorded_picture(
         pytest.importorskip("pycolmap")
     arguments = ["dycheck", "--root", str(sequence), "--out", str(tmp_path), "--protocol", protocol]
     assert evaluate.run([*arguments, *FAST]) == 0
-    said = capsys.readouterr().out
-    assert f"protocol {protocol}" in said
-    assert "mLPIPS is left out" in said
-    found = json.loads((tmp_path / "scores.json").read_text())
-    fitted, unchanged = found["mean"]["this fit"], found["mean"]["recorded picture of that time"]
+    printed = capsys.readouterr().out
+    assert f"protocol {protocol}" in printed
+    assert "mLPIPS is left out" in printed
+    written = json.loads((tmp_path / "scores.json").read_text())
+    fitted, unchanged = written["mean"]["this fit"], written["mean"]["recorded picture of that time"]
     assert fitted["mpsnr"] > unchanged["mpsnr"] + 2
     assert fitted["mssim"] > unchanged["mssim"]
     truth = read_sequence(sequence, protocol)
     assert sorted(path.stem for path in (tmp_path / "rgb").iterdir()) == sorted(truth.validation)
     for name in truth.validation:  # the scores are those of the pictures that were written
-        drawn = read_picture(tmp_path / "rgb" / f"{name}.png")
+        rendered = read_picture(tmp_path / "rgb" / f"{name}.png")
         true, mask = truth.true_picture(name), truth.covisible(name)
-        assert found["images"][name]["mpsnr"] == pytest.approx(masked_psnr_db(drawn, true, mask), abs=1e-4)
-        assert found["images"][name]["mssim"] == pytest.approx(partial_ssim(drawn, true, mask), abs=1e-4)
-    means = {score: np.mean([image[score] for image in found["images"].values()]) for score in fitted}
+        assert written["images"][name]["mpsnr"] == pytest.approx(masked_psnr_db(rendered, true, mask), abs=1e-4)
+        assert written["images"][name]["mssim"] == pytest.approx(partial_ssim(rendered, true, mask), abs=1e-4)
+    means = {score: np.mean([image[score] for image in written["images"].values()]) for score in fitted}
     assert fitted == pytest.approx(means, abs=1e-4)
 
 
@@ -56,11 +56,11 @@ def test_the_table_of_five_sequences(
         (tmp_path / name / "scores.json").write_text(json.dumps({"protocol": "som", "mean": mean}))
     arguments = ["--data", str(tmp_path), "--out", str(tmp_path)]
     assert benchmark.main(arguments) == 0
-    said = capsys.readouterr().out
-    assert "| this fit, spin | 18.00 | 0.600 | - |" in said
-    assert "| this fit, mean | 17.00 | 0.600 | - |" in said
-    assert "| published: the paper | 17.07 | 0.66 | 0.38 |" in said
-    assert "T-NeRF (DyCheck)" not in said
+    printed = capsys.readouterr().out
+    assert "| this fit, spin | 18.00 | 0.600 | - |" in printed
+    assert "| this fit, mean | 17.00 | 0.600 | - |" in printed
+    assert "| published: the paper | 17.07 | 0.66 | 0.38 |" in printed
+    assert "T-NeRF (DyCheck)" not in printed
     with pytest.raises(ConfigError, match="is of protocol som, not dycheck"):
         benchmark.main([*arguments, "--protocol", "dycheck"])
     assert benchmark.main([*arguments, "--sequences", "apple", "spin"]) == 0

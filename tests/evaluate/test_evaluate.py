@@ -48,13 +48,13 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def psnr(folder: Path, out: Path, camera: str) -> float:
-    """Of the drawn views over pixels that the recorded camera saw at some time."""
+    """Of the rendered views over pixels that the recorded camera saw at some time."""
     truth = np.load(folder / "gt" / "heldout" / f"{camera}.npz")
     errors = []
     for frame, seen in zip(truth["frame"], np.moveaxis(truth["covis"], -1, 0) > 0, strict=True):
-        drawn = read_picture(out / camera / f"rgb_{frame:04d}.png").astype(float)
+        rendered = read_picture(out / camera / f"rgb_{frame:04d}.png").astype(float)
         true = read_picture(folder / "gt" / "heldout" / camera / f"rgb_{frame:04d}.png").astype(float)
-        errors.append(((drawn - true)[seen] ** 2).mean())
+        errors.append(((rendered - true)[seen] ** 2).mean())
     return float(10 * np.log10(255**2 / np.mean(errors)))
 
 
@@ -87,11 +87,11 @@ def test_what_moves_is_scored_with_and_without_overlay(whole: Path, tmp_path: Pa
 @pytest.mark.slow
 def test_views_are_close_to_the_true_ones(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("nvs", "--scene", str(folder), "--out", str(tmp_path), *FAST) == 0
-    said = capsys.readouterr().out
-    assert all(stage in said for stage in ("read", "priors and initialisation", "fit", "render"))
+    printed = capsys.readouterr().out
+    assert all(stage in printed for stage in ("read", "priors and initialisation", "fit", "render"))
     cameras = sorted(path.stem for path in (folder / "gt" / "heldout").glob("*.npz"))
     assert {path.name for path in tmp_path.iterdir()} == {*cameras, "scores.json"}
-    assert "| mean |" in said
+    assert "| mean |" in printed
     scores = json.loads((tmp_path / "scores.json").read_text())
     assert sorted(scores["cameras"]) == cameras
     # Measured at this small size: 20.8, 22.2, 21.6, 22.1 dB.
@@ -138,6 +138,6 @@ def test_without_depth_and_without_truth(folder: Path, tmp_path: Path, capsys: p
 )
 def test_bad_input(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(*arguments) == 2
-    said = capsys.readouterr().err
-    assert message in said
-    assert said.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert message in printed
+    assert printed.count("\n") == 1

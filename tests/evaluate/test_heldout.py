@@ -50,26 +50,26 @@ def test_the_fit_beats_the_recorded_picture(
     desk: Path, calibration: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert evaluate.run(arguments(desk, calibration, tmp_path)) == 0
-    said = capsys.readouterr().out
-    found = json.loads((tmp_path / "scores.json").read_text())
+    printed = capsys.readouterr().out
+    written = json.loads((tmp_path / "scores.json").read_text())
     assert len(list(tmp_path.glob("rgb_*.png"))) == 12
-    assert found["train_camera"] == "observation.images.front"
-    assert found["depth_from"] == []
-    assert 0.3 < found["covered"] < 1
-    rows = found["rows"]
+    assert written["train_camera"] == "observation.images.front"
+    assert written["depth_from"] == []
+    assert 0.3 < written["covered"] < 1
+    rows = written["rows"]
     assert rows["this fit"]["psnr"] > rows["recorded picture"]["psnr"] + 2
     assert rows["depth warp"]["psnr"] > rows["recorded picture"]["psnr"]
     for name in rows:
-        assert f"| {name} |" in said
+        assert f"| {name} |" in printed
 
 
 def test_colours_are_fitted_to_the_other_half_of_the_frames() -> None:
-    drawn = np.random.default_rng(0).integers(0, 100, (4, 30, 40, 3)).astype(np.uint8)
-    true = drawn + np.uint8(50)
-    seen = np.full(drawn.shape[:3], 2, np.uint8)
-    assert score_half(drawn, TrueViews(true, seen))["psnr"] > 50
+    rendered = np.random.default_rng(0).integers(0, 100, (4, 30, 40, 3)).astype(np.uint8)
+    true = rendered + np.uint8(50)
+    seen = np.full(rendered.shape[:3], 2, np.uint8)
+    assert score_half(rendered, TrueViews(true, seen))["psnr"] > 50
     true[1::2] += 20  # of the half that is scored: not made up for
-    assert score_half(drawn, TrueViews(true, seen))["psnr"] == pytest.approx(20 * np.log10(255 / 20), abs=0.2)
+    assert score_half(rendered, TrueViews(true, seen))["psnr"] == pytest.approx(20 * np.log10(255 / 20), abs=0.2)
 
 
 def test_the_black_border_of_undistorted_pictures_is_left_out() -> None:
@@ -104,6 +104,6 @@ def test_bad_input(
     with pytest.raises(SystemExit) as caught:
         run_command(evaluate.run, arguments(desk, path, tmp_path / "out", train, test))
     assert caught.value.code == 2
-    said = capsys.readouterr().err
-    assert message in said
-    assert said.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert message in printed
+    assert printed.count("\n") == 1

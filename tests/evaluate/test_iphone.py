@@ -28,36 +28,35 @@ def test_what_is_read_is_what_was_written(
 ) -> None:
     if protocol == "som":
         pytest.importorskip("pycolmap")
-    found = read_sequence(sequence, protocol)
+    read = read_sequence(sequence, protocol)
     width, height = WIDTH // factor, HEIGHT // factor
     hand_held = hand_held_camera(FRAMES, WIDTH, HEIGHT).resized(width, height)
-    assert found.view.rgb.shape == (FRAMES, height, width, 3)
-    torch.testing.assert_close(found.view.camera.intrinsics, hand_held.intrinsics)
-    torch.testing.assert_close(found.view.camera.world_from_camera, hand_held.world_from_camera, atol=1e-5, rtol=0)
+    assert read.view.rgb.shape == (FRAMES, height, width, 3)
+    torch.testing.assert_close(read.view.camera.intrinsics, hand_held.intrinsics)
+    torch.testing.assert_close(read.view.camera.world_from_camera, hand_held.world_from_camera, atol=1e-5, rtol=0)
     truth = heldout_cameras(3, width, height)
-    assert found.validation == ("1_00000", "1_00005", "1_00010", "2_00000", "2_00005", "2_00010")
-    assert found.frames == (0, 5, 10) * 2
+    assert read.validation == ("1_00000", "1_00005", "1_00010", "2_00000", "2_00005", "2_00010")
+    assert read.frames == (0, 5, 10) * 2
     expected = torch.cat((truth["az+10"].world_from_camera, truth["el+08"].world_from_camera))
-    torch.testing.assert_close(found.cameras.world_from_camera, expected, atol=1e-5, rtol=0)
-    torch.testing.assert_close(found.cameras.intrinsics[:3], truth["az+10"].intrinsics)
+    torch.testing.assert_close(read.cameras.world_from_camera, expected, atol=1e-5, rtol=0)
+    torch.testing.assert_close(read.cameras.intrinsics[:3], truth["az+10"].intrinsics)
     seen = push.render(truth["el+08"], [0, 5, 10])
-    assert (found.true_picture("2_00005") == seen.rgb[1].numpy()).all()
-    assert 0.6 < found.covisible("2_00005").mean() <= 1
-    assert found.view.depth is not None
-    torch.testing.assert_close(found.view.depth, push.render(hand_held).depth)
+    assert (read.true_picture("2_00005") == seen.rgb[1].numpy()).all()
+    assert 0.6 < read.covisible("2_00005").mean() <= 1
+    assert read.view.depth is not None
+    torch.testing.assert_close(read.view.depth, push.render(hand_held).depth)
 
 
 def test_the_camera_sways_as_far_as_is_asked(push: SyntheticScene, tmp_path: Path) -> None:
     write_iphone_folder(push, tmp_path / "seq", sway_deg=20.0)
-    found = read_sequence(tmp_path / "seq", "dycheck").view.camera.world_from_camera
+    poses = read_sequence(tmp_path / "seq", "dycheck").view.camera.world_from_camera
     wanted = hand_held_camera(FRAMES, WIDTH, HEIGHT, 20.0).world_from_camera
-    torch.testing.assert_close(found, wanted, atol=1e-5, rtol=0)
+    torch.testing.assert_close(poses, wanted, atol=1e-5, rtol=0)
 
 
 def test_priors_of_the_package(sequence: Path, push: SyntheticScene) -> None:
     pytest.importorskip("pycolmap")
-    found = read_sequence(sequence, "som")
-    priors = read_priors(found, WIDTH // 2)
+    priors = read_priors(read_sequence(sequence, "som"), WIDTH // 2)
     seen = push.render(hand_held_camera(FRAMES, WIDTH, HEIGHT))
     assert priors.masks is not None
     assert priors.depth is not None
@@ -148,6 +147,6 @@ def test_bad_files_are_named(
             evaluate.run, ["dycheck", "--root", str(root), "--out", str(tmp_path / "out"), "--protocol", "dycheck"]
         )
     assert caught.value.code == 2
-    said = capsys.readouterr().err
-    assert message in said
-    assert said.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert message in printed
+    assert printed.count("\n") == 1

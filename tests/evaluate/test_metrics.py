@@ -47,7 +47,7 @@ def slow_pass(values: np.ndarray, weight: np.ndarray, kernel: list[float]) -> tu
     return out, seen
 
 
-def slow_mssim(drawn: np.ndarray, true: np.ndarray, mask: np.ndarray) -> float:
+def slow_mssim(rendered: np.ndarray, true: np.ndarray, mask: np.ndarray) -> float:
     """DyCheck's mSSIM from its definition."""
     taps = [math.exp(-0.5 * ((k - 5) / 1.5) ** 2) for k in range(11)]
     kernel = [tap / sum(taps) for tap in taps]
@@ -56,40 +56,40 @@ def slow_mssim(drawn: np.ndarray, true: np.ndarray, mask: np.ndarray) -> float:
         rows, seen = slow_pass(values, mask.astype(float), kernel)
         return slow_pass(rows.T, seen.T, kernel)[0].T
 
-    found = []
+    terms = []
     for channel in range(3):
-        a, b = drawn[..., channel] / 255, true[..., channel] / 255
+        a, b = rendered[..., channel] / 255, true[..., channel] / 255
         ma, mb = mean(a), mean(b)
         va, vb = np.maximum(mean(a * a) - ma**2, 0), np.maximum(mean(b * b) - mb**2, 0)
         cab = mean(a * b) - ma * mb
         cab = np.sign(cab) * np.minimum(np.sqrt(va * vb), np.abs(cab))
-        found.append((2 * ma * mb + 1e-4) * (2 * cab + 9e-4) / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4)))
-    return float(np.mean(found))
+        terms.append((2 * ma * mb + 1e-4) * (2 * cab + 9e-4) / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4)))
+    return float(np.mean(terms))
 
 
 @pytest.mark.parametrize("name", masks())
 def test_mssim_is_the_definition_s(name: str) -> None:
-    drawn, true = pair()
+    rendered, true = pair()
     mask = masks()[name]
-    assert partial_ssim(drawn, true, mask) == pytest.approx(slow_mssim(drawn, true, mask), abs=1e-9)
+    assert partial_ssim(rendered, true, mask) == pytest.approx(slow_mssim(rendered, true, mask), abs=1e-9)
 
 
 def test_golden_values_of_mssim() -> None:
     """Printed by `slow_mssim`; what the mask leaves out counts as perfect."""
-    drawn, true = pair()
-    found = {name: round(partial_ssim(drawn, true, mask), 3) for name, mask in masks().items()}
-    assert found == {"full": 0.625, "half": 0.824, "few": 0.996, "empty": 1.0, "scattered": 0.869, "weights": 0.793}
+    rendered, true = pair()
+    ssim = {name: round(partial_ssim(rendered, true, mask), 3) for name, mask in masks().items()}
+    assert ssim == {"full": 0.625, "half": 0.824, "few": 0.996, "empty": 1.0, "scattered": 0.869, "weights": 0.793}
 
 
 def test_psnr_is_the_mean_over_the_mask() -> None:
-    drawn, true = pair()
+    rendered, true = pair()
     for name, mask in masks().items():
         total = weight = 0.0
-        for i, j, c in np.ndindex(drawn.shape):
-            total += mask[i, j] * (drawn[i, j, c] / 255 - true[i, j, c] / 255) ** 2
+        for i, j, c in np.ndindex(rendered.shape):
+            total += mask[i, j] * (rendered[i, j, c] / 255 - true[i, j, c] / 255) ** 2
             weight += mask[i, j]
         expected = -10 * math.log10(total / weight) if weight else math.inf
-        assert masked_psnr_db(drawn, true, mask) == pytest.approx(expected), name
+        assert masked_psnr_db(rendered, true, mask) == pytest.approx(expected), name
 
 
 def test_the_same_picture_is_perfect() -> None:
@@ -101,20 +101,20 @@ def test_the_same_picture_is_perfect() -> None:
 
 
 def test_ssim_inside_a_mask_does_not_see_the_rest() -> None:
-    drawn, true = pair()
+    rendered, true = pair()
     mask = masks()["half"]
-    changed = drawn.copy()
+    changed = rendered.copy()
     changed[~mask] = 0
-    assert inside_ssim(changed, true, mask) == pytest.approx(inside_ssim(drawn, true, mask))
-    assert inside_ssim(drawn, true, mask) < 0.9
+    assert inside_ssim(changed, true, mask) == pytest.approx(inside_ssim(rendered, true, mask))
+    assert inside_ssim(rendered, true, mask) < 0.9
 
 
-def slow_inside_ssim(drawn: np.ndarray, true: np.ndarray, mask: np.ndarray) -> float:
+def slow_inside_ssim(rendered: np.ndarray, true: np.ndarray, mask: np.ndarray) -> float:
     """Weighted moments over the pixels of the window that are in the mask, at every pixel of the mask."""
     tap = np.exp(-0.5 * ((np.arange(11) - 5) / 1.5) ** 2)
     inside = np.pad(mask, 5)
-    a, b = (np.pad(picture / 255, ((5, 5), (5, 5), (0, 0))) for picture in (drawn, true))
-    found = []
+    a, b = (np.pad(picture / 255, ((5, 5), (5, 5), (0, 0))) for picture in (rendered, true))
+    terms = []
     for i, j in np.argwhere(mask):
         window = np.s_[i : i + 11, j : j + 11]
         weight = (np.outer(tap, tap) * inside[window])[..., None]
@@ -122,15 +122,15 @@ def slow_inside_ssim(drawn: np.ndarray, true: np.ndarray, mask: np.ndarray) -> f
         ma, mb = (weight * a[window]).sum((0, 1)), (weight * b[window]).sum((0, 1))
         da, db = a[window] - ma, b[window] - mb
         va, vb, cab = (weight * da * da).sum((0, 1)), (weight * db * db).sum((0, 1)), (weight * da * db).sum((0, 1))
-        found.append((2 * ma * mb + 1e-4) * (2 * cab + 9e-4) / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4)))
-    return float(np.mean(found))
+        terms.append((2 * ma * mb + 1e-4) * (2 * cab + 9e-4) / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4)))
+    return float(np.mean(terms))
 
 
 @pytest.mark.parametrize("name", ["full", "half", "few", "scattered"])
 def test_ssim_inside_is_the_definition_s(name: str) -> None:
-    drawn, true = pair()
+    rendered, true = pair()
     mask = masks()[name]
-    assert inside_ssim(drawn, true, mask) == pytest.approx(slow_inside_ssim(drawn, true, mask), abs=1e-9)
+    assert inside_ssim(rendered, true, mask) == pytest.approx(slow_inside_ssim(rendered, true, mask), abs=1e-9)
 
 
 def test_pictures_are_truncated_to_8_bits() -> None:
@@ -143,12 +143,12 @@ def test_flicker_is_what_changes_beyond_the_truth() -> None:
     true[1] = 40  # a true change of brightness is none
     everywhere = np.ones(true.shape[:3], bool)
     assert flicker(true + np.uint8(7), true, everywhere) == 0
-    drawn = true.copy()
-    drawn[1] += 6
-    assert flicker(drawn, true, everywhere) == 6
-    drawn[:, 0] = 99
+    rendered = true.copy()
+    rendered[1] += 6
+    assert flicker(rendered, true, everywhere) == 6
+    rendered[:, 0] = 99
     below = everywhere.copy()
     below[:, 0] = False
-    assert flicker(drawn, true, below) == 6
+    assert flicker(rendered, true, below) == 6
     below[1] = False
-    assert math.isnan(flicker(drawn, true, below))
+    assert math.isnan(flicker(rendered, true, below))

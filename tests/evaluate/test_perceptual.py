@@ -24,15 +24,15 @@ def test_flip_grows_with_the_difference_and_keeps_to_the_mask() -> None:
     values = [masked_flip(*pair(noise), full) for noise in (0, 8, 30)]
     assert values[0] == 0
     assert 0 < values[1] < values[2] < 1
-    drawn, true = pair(0)
-    drawn = drawn.copy()
-    drawn[:, :20] = 255
+    rendered, true = pair(0)
+    rendered = rendered.copy()
+    rendered[:, :20] = 255
     left = np.zeros_like(full)
     left[:, :20] = True
     far = np.zeros_like(full)
     far[:, 40:] = True
-    assert masked_flip(drawn, true, left) > 0.3
-    assert masked_flip(drawn, true, far) < 1e-3
+    assert masked_flip(rendered, true, left) > 0.3
+    assert masked_flip(rendered, true, far) < 1e-3
 
 
 def test_flip_of_black_and_white() -> None:
@@ -49,13 +49,13 @@ def test_mlpips_is_the_mean_of_the_map_over_the_mask() -> None:
         seen.extend((one, other))
         return (one - other).abs().sum(1, keepdim=True)
 
-    drawn, true = np.full((4, 5, 3), 255, np.uint8), np.zeros((4, 5, 3), np.uint8)
+    rendered, true = np.full((4, 5, 3), 255, np.uint8), np.zeros((4, 5, 3), np.uint8)
     mask = np.zeros((4, 5), bool)
     mask[0] = True
-    assert masked_lpips(drawn, true, mask, network) == 6
+    assert masked_lpips(rendered, true, mask, network) == 6
     assert seen[0].unique().tolist() == [-1, 1]
     assert seen[1].unique().tolist() == [-1]
-    assert masked_lpips(drawn, true, ~mask & mask, network) == 0
+    assert masked_lpips(rendered, true, ~mask & mask, network) == 0
 
 
 @pytest.mark.slow

@@ -8,8 +8,8 @@ import torch
 from lerobot_msdyn.augment import __main__ as augment
 from lerobot_msdyn.core.config import Device, Recipe
 from lerobot_msdyn.core.observations import View
-from lerobot_msdyn.reconstruction import reconstruct as pipeline
 from lerobot_msdyn.reconstruction.account import decibels
+from lerobot_msdyn.reconstruction.reconstruct import reconstruct
 from lerobot_msdyn.render.availability import cuda_problem
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.views.pictures import new_pictures, on_device
@@ -29,16 +29,16 @@ def _gpu() -> None:
 def test_both_routes_reach_the_same_held_out_quality() -> None:
     video = make_scene("push", 0, 40, 160, 120)
     seen = video.render(video.camera)
-    found, pictures = {}, {}
+    held_out_db, pictures = {}, {}
     for device in ROUTES:
         recipe = Recipe(device=device)
         recipe.fit.steps, recipe.priors.cache = 200, "off"
-        scene = pipeline.reconstruct(View(seen.rgb, video.camera, seen.depth), recipe)
+        scene = reconstruct(View(seen.rgb, video.camera, seen.depth), recipe)
         assert scene.windows[0].scene.device.type == "cpu"
-        found[device] = decibels(float(scene.windows[0].self_check.fitted_error.mean()))
-        drawn = on_device(scene, torch.device(device))
-        pictures[device] = next(new_pictures(drawn, scene.camera)).rgb.astype(float)
-    assert abs(found["cuda"] - found["cpu"]) < MAX_DIFFERENCE_DB, found
+        held_out_db[device] = decibels(float(scene.windows[0].self_check.fitted_error.mean()))
+        ready = on_device(scene, torch.device(device))
+        pictures[device] = next(new_pictures(ready, scene.camera)).rgb.astype(float)
+    assert abs(held_out_db["cuda"] - held_out_db["cpu"]) < MAX_DIFFERENCE_DB, held_out_db
     assert abs(pictures["cuda"] - pictures["cpu"]).mean() < 2
 
 

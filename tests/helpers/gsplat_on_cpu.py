@@ -49,7 +49,7 @@ def _composited(
     means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, width: int, height: int, tile_size: int,
     isect_offsets: Tensor, flatten_ids: Tensor, backgrounds: None, packed: bool, absgrad: bool,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """As the kernel RasterizeToPixels3DGSFwd, a thread of which draws a pixel; here all pixels of a tile at once."""
+    """As the kernel RasterizeToPixels3DGSFwd, a thread of which renders a pixel; here all pixels of a tile at once."""
     leading, channels = colors.shape[:-2], colors.shape[-1]
     centres, shapes = means2d.reshape(-1, 2), conics.reshape(-1, 3)
     values, opaque = colors.reshape(-1, channels), opacities.reshape(-1)

@@ -20,7 +20,7 @@ class Scene:
     width: int
     height: int
 
-    def draw(
+    def render(
         self, backend: str, dtype: torch.dtype = torch.float32, device: str = "cpu"
     ) -> tuple[Raster, list[Tensor]]:
         """The images, and the leaves (Gaussians, then poses) that their gradients go to."""
@@ -99,9 +99,9 @@ def compare(
     Where rounding decides whether an alpha counts as below 1/255, or a pixel as opaque, the two differ by a finite
     step. Such pixels are counted, and receive no gradient.
     """
-    fast, fast_leaves = scene.draw(backend, device=device)
+    fast, fast_leaves = scene.render(backend, device=device)
     fast = Raster(fast.features.cpu(), fast.depth.cpu(), fast.alpha.cpu())
-    exact, exact_leaves = scene.draw("reference", torch.float64)
+    exact, exact_leaves = scene.render("reference", torch.float64)
     errors = [
         (fast.features - exact.features).abs().amax(-1),
         (fast.depth - exact.depth).abs(),

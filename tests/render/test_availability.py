@@ -75,16 +75,16 @@ def test_kernels_that_do_not_compile_are_said_in_one_line(machine: pytest.Monkey
     def fail(*arguments: object) -> None:
         raise RuntimeError("Error building extension 'gsplat_cuda'\nmany\nlines")
 
-    broken.draw_with_gsplat = fail  # type: ignore[attr-defined]
+    broken.render_with_gsplat = fail  # type: ignore[attr-defined]
     ones = torch.ones
     eye = torch.eye
     machine.setitem(sys.modules, "lerobot_msdyn.render.cuda", broken)
     machine.setattr(availability.importlib.metadata, "version", lambda name: "1.5.3")
     machine.setattr(torch, "ones", lambda *shape, device: ones(*shape))
     machine.setattr(torch, "eye", lambda size, device: eye(size))
-    said = availability._failure()
-    assert said.startswith("gsplat 1.5.3 cannot compile or run its kernels (Error building extension 'gsplat_cuda')")
-    assert "\n" not in said
+    reason = availability._failure()
+    assert reason.startswith("gsplat 1.5.3 cannot compile or run its kernels (Error building extension 'gsplat_cuda')")
+    assert "\n" not in reason
 
 
 def test_what_is_missing_is_said_where_the_gpu_was_demanded(machine: pytest.MonkeyPatch) -> None:
@@ -113,8 +113,8 @@ def test_auto_says_once_why_it_is_not_the_gpu(
     machine.setattr(availability.importlib.util, "find_spec", lambda name: None)
     with caplog.at_level("INFO"):
         assert [devices.chosen_device("auto") for _ in range(2)] == [torch.device("cpu")] * 2
-    said = [record for record in caplog.records if record.name == "lerobot_msdyn.render.devices"]
-    assert [(record.levelname, "fitting and rendering on the CPU" in record.getMessage()) for record in said] == [
+    logged = [record for record in caplog.records if record.name == "lerobot_msdyn.render.devices"]
+    assert [(record.levelname, "fitting and rendering on the CPU" in record.getMessage()) for record in logged] == [
         (level, True)
     ]
     caplog.clear()

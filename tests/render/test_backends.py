@@ -1,4 +1,4 @@
-"""Which backend draws, and what `rasterize` refuses."""
+"""Which backend renders, and what `rasterize` refuses."""
 
 import logging
 import math
@@ -24,9 +24,9 @@ def arguments(scene, **changes: Any) -> dict[str, Any]:
     return values | changes
 
 
-def test_auto_draws_float32_on_the_cpu_with_numba(make_scene):
+def test_auto_renders_float32_on_the_cpu_with_numba(make_scene):
     scene = make_scene()
-    assert torch.equal(rasterize(**arguments(scene)).features, scene.draw("cpu")[0].features)
+    assert torch.equal(rasterize(**arguments(scene)).features, scene.render("cpu")[0].features)
 
 
 @pytest.mark.parametrize("channels", [3, 17])
@@ -40,8 +40,8 @@ def test_auto_leaves_float64_and_many_channels_to_the_reference(make_scene, chan
 
 
 def test_auto_falls_back_with_one_warning_where_numba_cannot_run(make_scene, monkeypatch, caplog):
-    draw = backends.rasterize_reference
-    monkeypatch.setattr(backends, "_load", lambda name: (None, "no numba here") if name == "cpu" else (draw, ""))
+    reference = backends.rasterize_reference
+    monkeypatch.setattr(backends, "_load", lambda name: (None, "no numba here") if name == "cpu" else (reference, ""))
     backends._warn_once.cache_clear()
     with caplog.at_level(logging.WARNING):
         rasterize(**arguments(make_scene()))
@@ -119,9 +119,9 @@ def test_bad_options_are_refused(make_scene, change, message):
 
 def test_the_cpu_backend_takes_float32_and_16_channels(make_scene):
     with pytest.raises(RenderError, match=r"got torch.float64 on cpu; expected torch.float32 on cpu"):
-        make_scene().draw("cpu", torch.float64)
+        make_scene().render("cpu", torch.float64)
     with pytest.raises(RenderError, match="got 17 feature channels; expected at most 16"):
-        make_scene(channels=17).draw("cpu")
+        make_scene(channels=17).render("cpu")
 
 
 _PROBE = """

@@ -1,4 +1,4 @@
-"""The CPU rasterizer draws what the reference draws, and its gradients are the reference's."""
+"""The CPU rasterizer renders what the reference renders, and its gradients are the reference's."""
 
 from typing import Any
 
@@ -42,7 +42,7 @@ def test_batches_of_views_and_of_scenes(make_scene, compare_with_reference, per_
 
 def test_views_of_a_batch_equal_single_views(make_scene):
     scene = make_scene(views=3)
-    together, _ = scene.draw("cpu")
+    together, _ = scene.render("cpu")
     for view in range(3):
         camera = (scene.poses[view : view + 1], scene.intrinsics[view : view + 1])
         arguments: Any = (*scene.gaussians, *camera, scene.width, scene.height)
@@ -68,30 +68,30 @@ def test_large_needles_and_specks(make_scene, compare_with_reference):
     assert_agrees(compare_with_reference(scene), pixels_off=1e-3, gradient=1e-2)
 
 
-def test_scales_beyond_float32_are_not_drawn(make_scene):
+def test_scales_beyond_float32_are_not_rendered(make_scene):
     scene = make_scene(count=3)
     scene.gaussians[2][0] = 1e30
     scene.gaussians[0][1] = torch.tensor([1e30, 0, 2.0])
     for backend in ("cpu", "reference"):
-        raster, leaves = scene.draw(backend)
+        raster, leaves = scene.render(backend)
         (raster.alpha.sum() + raster.depth.sum()).backward()
         assert all(leaf.grad.isfinite().all() for leaf in leaves)
     other = make_scene(count=3)
     other.gaussians[3][:2] = 0
-    torch.testing.assert_close(scene.draw("cpu")[0].alpha, other.draw("cpu")[0].alpha)
+    torch.testing.assert_close(scene.render("cpu")[0].alpha, other.render("cpu")[0].alpha)
 
 
 def test_gaussians_behind_the_camera_get_no_gradient(make_scene):
     scene = make_scene(count=4)
     scene.gaussians[0][:2, 2] *= -1
-    raster, leaves = scene.draw("cpu")
+    raster, leaves = scene.render("cpu")
     raster.alpha.sum().backward()
     assert leaves[0].grad[:2].abs().max() == 0
     assert leaves[0].grad[2:].abs().max() > 0
 
 
 def test_an_empty_scene(make_scene):
-    raster, leaves = make_scene(count=0, views=2, channels=5).draw("cpu")
+    raster, leaves = make_scene(count=0, views=2, channels=5).render("cpu")
     assert raster.features.shape == (2, 45, 77, 5)
     assert raster.alpha.abs().max() == 0
     (raster.depth.sum() + raster.features.sum()).backward()
@@ -99,8 +99,8 @@ def test_an_empty_scene(make_scene):
     assert leaves[5].grad.abs().max() == 0
 
 
-def test_depth_is_zero_where_nothing_is_drawn(make_scene):
-    raster, _ = make_scene(count=5).draw("cpu")
+def test_depth_is_zero_where_nothing_is_rendered(make_scene):
+    raster, _ = make_scene(count=5).render("cpu")
     nothing = raster.alpha == 0
     assert nothing.any()
     assert not nothing.all()
@@ -117,7 +117,7 @@ def test_only_some_outputs_and_inputs_take_part(make_scene):
         backend="cpu",
     )  # fmt: skip
     raster.features.sum().backward()
-    everything, leaves = scene.draw("cpu")
+    everything, leaves = scene.render("cpu")
     everything.features.sum().backward()
     assert torch.equal(features.grad, leaves[4].grad)
     assert means.grad is None
@@ -130,4 +130,4 @@ def test_tensors_need_not_be_contiguous(make_scene):
     expanded = (*strided[:4], features[None].expand(2, *features.shape))
     poses = scene.poses.transpose(1, 2).contiguous().transpose(1, 2)
     raster = rasterize(*expanded, poses, scene.intrinsics, scene.width, scene.height, backend="cpu")
-    assert torch.equal(raster.features, scene.draw("cpu")[0].features)
+    assert torch.equal(raster.features, scene.render("cpu")[0].features)

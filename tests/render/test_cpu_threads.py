@@ -17,7 +17,7 @@ def restore_threads():
 
 
 def images_and_gradients(scene):
-    raster, leaves = scene.draw("cpu")
+    raster, leaves = scene.render("cpu")
     (raster.features.square().sum() + raster.depth.sum() + raster.alpha.sin().sum()).backward()
     return [raster.features.detach(), raster.depth.detach(), raster.alpha.detach(), *(leaf.grad for leaf in leaves)]
 

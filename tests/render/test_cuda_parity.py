@@ -1,4 +1,4 @@
-"""The CUDA route draws what the reference and the CPU route draw, with their gradients; skipped without a GPU.
+"""The CUDA route renders what the reference and the CPU route render, with their gradients; skipped without a GPU.
 
 gsplat computes with fast approximations (`-use_fast_math`), its sums of gradients are in no fixed order, and it gets
 alpha as 1 - T: bounds are wider than those of the CPU route. From gsplat 1.6 on the cap of alpha is 0.99, not 0.999.
@@ -54,34 +54,34 @@ def test_saturated_pixels(make_scene, compare_with_reference):
     scene = make_scene(count=2000, radius=8.0, opacity=(0.97, 1.0))
     if find_spec("gsplat.cuda._constants") is None:  # gsplat up to 1.5
         assert_agrees(compare_with_reference(scene, "cuda", device="cuda", close_enough=CLOSE), pixels_off=2e-2)
-    fast, exact = scene.draw("cuda", device="cuda")[0], scene.draw("reference", torch.float64)[0]
+    fast, exact = scene.render("cuda", device="cuda")[0], scene.render("reference", torch.float64)[0]
     assert (fast.features.cpu() - exact.features).abs().max() < 2e-2
 
 
-def test_what_is_not_drawn_gets_no_gradient(make_scene):
+def test_what_is_not_rendered_gets_no_gradient(make_scene):
     scene = make_scene(count=6)
     means, _, scales, opacities, _ = scene.gaussians
     means[0, 2] *= -1
     means[1] = torch.tensor([1e30, 0, 2.0])
     scales[2] = 1e30
     opacities[3] = 0.003
-    raster, leaves = scene.draw("cuda", device="cuda")
+    raster, leaves = scene.render("cuda", device="cuda")
     (raster.alpha.sum() + raster.depth.sum()).backward()
     assert all(leaf.grad.isfinite().all() for leaf in leaves)
     assert all(leaf.grad[:4].abs().max() == 0 for leaf in leaves[:5])
-    expected, _ = scene.draw("reference", torch.float64)
+    expected, _ = scene.render("reference", torch.float64)
     torch.testing.assert_close(raster.alpha.cpu().double(), expected.alpha, atol=1e-4, rtol=1e-3)
 
 
 def test_an_empty_scene_and_bad_values(make_scene):
-    raster, _ = make_scene(count=0, channels=5).draw("cuda", device="cuda")
+    raster, _ = make_scene(count=0, channels=5).render("cuda", device="cuda")
     assert raster.features.shape == (1, 45, 77, 5)
     scene = make_scene(count=4)
     scene.gaussians[0][2, 1] = float("nan")
     with pytest.raises(RenderError, match=r"means at index \[2, 1\] is nan"):
-        scene.draw("cuda", device="cuda")
+        scene.render("cuda", device="cuda")
     with pytest.raises(RenderError, match=r"expected torch\.float32 on cuda"):
-        make_scene().draw("cuda", torch.float64, device="cuda")
+        make_scene().render("cuda", torch.float64, device="cuda")
 
 
 def test_auto_takes_gsplat_on_the_gpu(make_scene):

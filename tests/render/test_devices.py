@@ -99,20 +99,20 @@ def test_what_is_made_of_a_fit(gpu: FakeGpu) -> None:
     with gpu:
         result = fitted(view, priors)
         seen = evidence_of(result.scene, view.camera, empty)
-        said = self_check(result.scene, view, priors, result.held_out)
+        check = self_check(result.scene, view, priors, result.held_out)
         overlay = unexplained(result.scene, view, priors)
         result = replace(result, scene=replace(result.scene, overlay=overlay))
         host = to_device((result.scene, seen), "cpu")
-        window = FittedWindow(0, *host, said, STEPS, 0.0, {})
+        window = FittedWindow(0, *host, check, STEPS, 0.0, {})
         scene = Reconstruction((window,), True, {}, view.camera, 1.0)
-        drawn = on_device(scene, GPU)
+        ready = on_device(scene, GPU)
         gpu.waits.clear()
         gpu.copies.clear()
-        pictures = list(new_pictures(drawn, view.camera, fill="none"))
+        pictures = list(new_pictures(ready, view.camera, fill="none"))
         waits, copies = Counter(gpu.waits), Counter(gpu.copies)
-        filled = list(new_pictures(drawn, view.camera))
-        scores = judge(drawn.windows, view.camera)
-        shares = [found.unseen_share for found in coverages(drawn, view.camera)]
+        filled = list(new_pictures(ready, view.camera))
+        scores = judge(ready.windows, view.camera)
+        shares = [coverage.unseen_share for coverage in coverages(ready, view.camera)]
     assert all(tensor.device.type == "cpu" for tensor in host[0].tensors().values())
     assert len(pictures) == len(filled) == len(shares) == FRAMES
     assert np.isfinite(scores.expected_db)

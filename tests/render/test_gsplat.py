@@ -31,7 +31,7 @@ def by_gsplat(scene, near: float = NEAR) -> tuple[Raster, list[Tensor]]:
     leaves = leaves_of(scene)
     with gsplat_on_cpu():
         arguments: Any = (*leaves, scene.intrinsics.double(), scene.width, scene.height, near)
-        raster = cuda.draw_with_gsplat(*arguments)
+        raster = cuda.render_with_gsplat(*arguments)
     return raster, leaves
 
 
@@ -42,17 +42,17 @@ def by_reference(scene, near: float = NEAR) -> tuple[Raster, list[Tensor]]:
 
 
 def assert_same(scene, near: float = NEAR) -> None:
-    found, expected = by_gsplat(scene, near), by_reference(scene, near)
+    by_kernels, expected = by_gsplat(scene, near), by_reference(scene, near)
     generator = torch.Generator().manual_seed(0)
-    for raster, leaves in (found, expected):
+    for raster, leaves in (by_kernels, expected):
         generator.manual_seed(0)
         images = (raster.features, raster.depth, raster.alpha)
         incoming = [torch.randn(image.shape, generator=generator, dtype=torch.float64) for image in images]
         torch.autograd.backward(images, incoming)
         assert all(leaf.grad is not None for leaf in leaves)
     for name in ("features", "depth", "alpha"):
-        torch.testing.assert_close(getattr(found[0], name), getattr(expected[0], name), rtol=1e-9, atol=1e-9)
-    for mine, theirs in zip(found[1], expected[1], strict=True):
+        torch.testing.assert_close(getattr(by_kernels[0], name), getattr(expected[0], name), rtol=1e-9, atol=1e-9)
+    for mine, theirs in zip(by_kernels[1], expected[1], strict=True):
         torch.testing.assert_close(mine.grad, theirs.grad, rtol=1e-6, atol=1e-8)
 
 
@@ -61,7 +61,7 @@ def test_pictures_and_gradients_of_a_batch(make_scene, per_view):
     assert_same(make_scene(count=30, width=37, height=23, views=2, per_view=per_view))
 
 
-@pytest.mark.parametrize("channels", [1, 5, 40])  # gsplat draws more than 32 in several passes
+@pytest.mark.parametrize("channels", [1, 5, 40])  # gsplat renders more than 32 in several passes
 def test_any_number_of_channels(make_scene, channels):
     assert_same(make_scene(count=20, width=19, height=17, channels=channels))
 
@@ -70,7 +70,7 @@ def test_saturated_pixels(make_scene):
     assert_same(make_scene(count=60, width=18, height=16, radius=6.0, opacity=(0.97, 1.0)))
 
 
-def test_what_is_not_drawn(make_scene):
+def test_what_is_not_rendered(make_scene):
     scene = make_scene(count=25, width=20, height=18)
     means, _, scales, opacities, _ = scene.gaussians
     means[0, 2] = -1.0  # behind

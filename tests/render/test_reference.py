@@ -14,7 +14,7 @@ FOCAL = 10.0
 SIZE = 9  # px; the centre pixel is (4, 4), its centre at (4.5, 4.5)
 
 
-def draw(means, opacities, features, scales=None, quats=None, camera=None, size=(SIZE, SIZE), **options):
+def render(means, opacities, features, scales=None, quats=None, camera=None, size=(SIZE, SIZE), **options):
     """Isotropic Gaussians in float64, seen by a camera at the origin that looks along +z."""
     width, height = size
     means = torch.as_tensor(means, dtype=torch.float64)
@@ -39,7 +39,7 @@ def draw(means, opacities, features, scales=None, quats=None, camera=None, size=
 
 
 def test_one_gaussian_has_its_opacity_at_its_centre_and_falls_off_as_a_gaussian():
-    raster = draw([[0, 0, 2.0]], [0.5], [[0.2, 0.6]])
+    raster = render([[0, 0, 2.0]], [0.5], [[0.2, 0.6]])
     variance = (0.2 * FOCAL / 2) ** 2 + 0.3
     assert raster.alpha[0, 4, 4].item() == pytest.approx(0.5)
     assert raster.alpha[0, 4, 6].item() == pytest.approx(0.5 * math.exp(-0.5 * 4 / variance))
@@ -49,7 +49,7 @@ def test_one_gaussian_has_its_opacity_at_its_centre_and_falls_off_as_a_gaussian(
 
 
 def test_alpha_below_one_255th_is_skipped():
-    raster = draw([[0, 0, 2.0]], [0.5], [[1.0]])
+    raster = render([[0, 0, 2.0]], [0.5], [[1.0]])
     variance = (0.2 * FOCAL / 2) ** 2 + 0.3
     reach = math.sqrt(2 * variance * math.log(255 * 0.5))  # 3.55 px: the pixel 3 away is in, 4 away is out
     assert 3 < reach < 4
@@ -61,7 +61,7 @@ def test_alpha_below_one_255th_is_skipped():
 def test_anisotropic_rotated_gaussian_follows_the_projected_covariance():
     # 90 degrees about z: the long axis x of the Gaussian becomes the image's y
     half = math.sqrt(0.5)
-    raster = draw([[0, 0, 1.0]], [0.8], [[1.0]], scales=[[0.2, 0.05, 0.1]], quats=[[3 * half, 0, 0, 3 * half]])
+    raster = render([[0, 0, 1.0]], [0.8], [[1.0]], scales=[[0.2, 0.05, 0.1]], quats=[[3 * half, 0, 0, 3 * half]])
     along_y = 0.8 * math.exp(-0.5 * 4 / ((0.2 * FOCAL) ** 2 + 0.3))
     along_x = 0.8 * math.exp(-0.5 * 4 / ((0.05 * FOCAL) ** 2 + 0.3))
     assert raster.alpha[0, 6, 4].item() == pytest.approx(along_y)
@@ -74,7 +74,7 @@ def test_two_gaussians_blend_front_to_back_whatever_their_order():
         means = [(near, far)[i] for i in order]
         opacities = [(0.6, 0.5)[i] for i in order]
         colors = [([1.0, 0.0], [0.0, 1.0])[i] for i in order]
-        raster = draw(means, opacities, colors)
+        raster = render(means, opacities, colors)
         weights = torch.tensor([0.6, 0.4 * 0.5], dtype=torch.float64)
         torch.testing.assert_close(raster.features[0, 4, 4], weights)
         assert raster.alpha[0, 4, 4].item() == pytest.approx(0.8)
@@ -82,9 +82,9 @@ def test_two_gaussians_blend_front_to_back_whatever_their_order():
 
 
 def test_alpha_is_capped_and_a_pixel_stops_before_it_is_opaque():
-    # transmittance: 1 -> 0.001 -> 0.0005 -> (next would be 5e-7: stop) and nothing behind is drawn
+    # transmittance: 1 -> 0.001 -> 0.0005 -> (next would be 5e-7: stop) and nothing behind is rendered
     means = [[0, 0, 1.0], [0, 0, 2.0], [0, 0, 3.0], [0, 0, 4.0]]
-    raster = draw(means, [1.0, 0.5, 1.0, 0.3], torch.eye(4))
+    raster = render(means, [1.0, 0.5, 1.0, 0.3], torch.eye(4))
     expected = torch.tensor([0.999, 0.0005, 0.0, 0.0], dtype=torch.float64)
     torch.testing.assert_close(raster.features[0, 4, 4], expected)
     assert raster.alpha[0, 4, 4].item() == pytest.approx(0.9995)
@@ -92,27 +92,27 @@ def test_alpha_is_capped_and_a_pixel_stops_before_it_is_opaque():
 
 def test_no_gradient_flows_through_a_capped_alpha():
     opacity = torch.ones(1, dtype=torch.float64, requires_grad=True)
-    draw([[0, 0, 2.0]], opacity, [[1.0]]).alpha[0, 4, 4].backward()
+    render([[0, 0, 2.0]], opacity, [[1.0]]).alpha[0, 4, 4].backward()
     assert opacity.grad is not None
     assert opacity.grad.item() == 0
 
 
 @pytest.mark.parametrize("z", [-1.0, 0.0, 0.01])
-def test_gaussians_behind_or_at_the_near_plane_are_not_drawn(z):
-    raster = draw([[0, 0, z], [0, 0, 2.0]], [0.9, 0.5], [[1.0], [0.5]])
+def test_gaussians_behind_or_at_the_near_plane_are_not_rendered(z):
+    raster = render([[0, 0, z], [0, 0, 2.0]], [0.9, 0.5], [[1.0], [0.5]])
     assert raster.features[0, 4, 4, 0].item() == pytest.approx(0.25)
 
 
 def test_the_near_plane_can_be_moved():
-    assert draw([[0, 0, 1.0]], [0.9], [[1.0]], near=1.5).alpha.max() == 0
+    assert render([[0, 0, 1.0]], [0.9], [[1.0]], near=1.5).alpha.max() == 0
 
 
 def test_empty_scene_and_one_pixel_image():
-    empty = draw(torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 2))
+    empty = render(torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 2))
     assert empty.features.shape == (1, SIZE, SIZE, 2)
     assert empty.alpha.abs().max() == 0
     assert empty.depth.abs().max() == 0
-    pixel = draw([[0, 0, 2.0]], [0.5], [[1.0]], size=(1, 1))
+    pixel = render([[0, 0, 2.0]], [0.5], [[1.0]], size=(1, 1))
     assert pixel.alpha.shape == (1, 1, 1)
     assert pixel.alpha.item() == pytest.approx(0.5)
 
@@ -120,20 +120,20 @@ def test_empty_scene_and_one_pixel_image():
 def test_views_see_the_scene_from_their_own_pose():
     shifted = torch.eye(4)
     shifted[0, 3] = 0.4  # camera 0.4 m to the left: at 2 m the Gaussian moves 2 px to the right
-    raster = draw([[0, 0, 2.0]], [0.5], [[1.0]], camera=torch.stack((torch.eye(4), shifted)))
+    raster = render([[0, 0, 2.0]], [0.5], [[1.0]], camera=torch.stack((torch.eye(4), shifted)))
     assert raster.alpha[0, 4, 4].item() == pytest.approx(0.5)
     assert raster.alpha[1, 4, 6].item() == pytest.approx(0.5)
 
 
 def test_covariance_is_linearised_no_further_than_the_tangent_margin():
     # A Gaussian long in z far to the left of the image: unclamped, its smear in x would be f X sz / Z^2.
-    raster = draw([[-3.0, 0, 1.0]], [1.0], [[1.0]], scales=[[1e-6, 1e-6, 0.9]])
+    raster = render([[-3.0, 0, 1.0]], [1.0], [[1.0]], scales=[[1e-6, 1e-6, 0.9]])
     limit = (SIZE / 2) / FOCAL * 1.3
     variance = (FOCAL * limit * 0.9) ** 2 + 0.3
     distance = 4.5 - (FOCAL * -3.0 + SIZE / 2)
     expected = math.exp(-0.5 * distance**2 / variance)
     assert raster.alpha[0, 4, 4].item() == pytest.approx(expected if expected >= 1 / 255 else 0.0)
-    closer = draw([[-1.0, 0, 1.0]], [1.0], [[1.0]], scales=[[1e-6, 1e-6, 0.9]])
+    closer = render([[-1.0, 0, 1.0]], [1.0], [[1.0]], scales=[[1e-6, 1e-6, 0.9]])
     distance = 4.5 - (FOCAL * -1.0 + SIZE / 2)
     assert closer.alpha[0, 4, 4].item() == pytest.approx(math.exp(-0.5 * distance**2 / variance))
 
@@ -192,4 +192,4 @@ def test_shared_gaussians_equal_the_same_set_given_per_view():
 def test_bad_values_are_named_with_their_first_index(change, message):
     arguments = {"means": [[0.0, 0, 2], [0, 0, 3]], "opacities": [0.5, 0.5], "features": [[1.0], [1.0]]}
     with pytest.raises(RenderError, match=message):
-        draw(**{**arguments, **change})
+        render(**{**arguments, **change})

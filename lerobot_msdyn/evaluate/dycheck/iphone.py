@@ -184,10 +184,10 @@ def _colmap_cameras(root: Path, names: Sequence[str]) -> tuple[Float[ndarray, "n
     absent = [name for name in names if f"{name}.png" not in images]
     if absent:
         raise DatasetError(f"{folder / 'sparse'}: has no camera of {len(absent)} pictures, {absent[0]}.png among them")
-    found = [images[f"{name}.png"] for name in names]
-    intrinsics = np.stack([model.cameras[image.camera_id].calibration_matrix() for image in found])
+    registered = [images[f"{name}.png"] for name in names]
+    intrinsics = np.stack([model.cameras[image.camera_id].calibration_matrix() for image in registered])
     poses = np.tile(np.eye(4), (len(names), 1, 1))
-    poses[:, :3] = np.stack([image.cam_from_world().inverse().matrix() for image in found])
+    poses[:, :3] = np.stack([image.cam_from_world().inverse().matrix() for image in registered])
     poses[:, :3, 3] *= metres
     return intrinsics, poses, metres
 
@@ -199,7 +199,7 @@ def _lidar(folder: Path, names: Sequence[str]) -> Float[ndarray, "t h w"] | None
     depth = np.stack([read_array(folder / f"{name}.npy").reshape(-1) for name in names])
     height, width = read_array(folder / f"{names[0]}.npy").shape[:2]
     depth = depth.reshape(len(names), height, width).astype(np.float32)
-    known = depth[depth > 0]
-    if len(known) and float(np.median(known)) > MILLIMETRES_FROM:
-        raise DatasetError(f"{folder}: depth of {np.median(known):.0f} in the middle; expected metres")
+    measured = depth[depth > 0]
+    if len(measured) and float(np.median(measured)) > MILLIMETRES_FROM:
+        raise DatasetError(f"{folder}: depth of {np.median(measured):.0f} in the middle; expected metres")
     return depth

@@ -27,15 +27,15 @@ def read_priors(sequence: IphoneSequence, width: int) -> Exchange:
     size = (min(width, full_width), round(full_height * min(width, full_width) / full_width))
     masks, depth = folder / "track_anything" / "1x", folder / "aligned_depth_anything_colmap" / "1x"
     tracks = folder / "2d_tracks" / "1x"
-    found: dict[str, Any] = {}
+    arrays: dict[str, Any] = {}
     if masks.is_dir():
-        found["masks"] = np.stack([_mask(masks / f"{name}.png", size) for name in names])
+        arrays["masks"] = np.stack([_mask(masks / f"{name}.png", size) for name in names])
     if depth.is_dir():
-        found["depth"] = _depth([depth / f"{name}.npy" for name in names], size) * np.float32(sequence.metres)
+        arrays["depth"] = _depth([depth / f"{name}.npy" for name in names], size) * np.float32(sequence.metres)
     if tracks.is_dir():
-        found |= _tracks(tracks, names)
-        found["tracks"] = found["tracks"] * np.float32(size[0] / full_width)
-    return Exchange(frames, size[1], size[0], **found)
+        arrays |= _tracks(tracks, names)
+        arrays["tracks"] = arrays["tracks"] * np.float32(size[0] / full_width)
+    return Exchange(frames, size[1], size[0], **arrays)
 
 
 def _mask(path: Path, size: tuple[int, int]) -> UInt8[ndarray, "h w"]:
@@ -62,12 +62,12 @@ def _tracks(folder: Path, names: Sequence[str]) -> dict[str, ndarray]:
         files = [read_array(folder / f"{names[query]}_{name}.npy").astype(np.float32) for name in names]
         if len({file.shape for file in files}) > 1 or files[0].ndim != 2 or files[0].shape[1] != 4:
             raise DatasetError(f"{folder}/{names[query]}_*.npy: files of tracks differ in shape, or are not [n, 4]")
-        some = np.stack(files, axis=1)[:: max(1, len(files[0]) // TRACKS_PER_QUERY)]
-        shown, accurate = _not(some[..., 2]), _not(some[..., 3])
-        positions.append(some[..., :2] + 0.5)
+        kept = np.stack(files, axis=1)[:: max(1, len(files[0]) // TRACKS_PER_QUERY)]
+        shown, accurate = _not(kept[..., 2]), _not(kept[..., 3])
+        positions.append(kept[..., :2] + 0.5)
         seen.append(shown * accurate > 0.5)
         sure.append(shown * accurate)
-        asked.append(np.full(len(some), query))
+        asked.append(np.full(len(kept), query))
     return {
         "tracks": np.concatenate(positions),
         "vis": np.concatenate(seen),

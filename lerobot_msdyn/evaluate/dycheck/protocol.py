@@ -29,7 +29,7 @@ PRIORS_FILE = "priors.npz"
 
 
 def evaluate_dycheck(config: DycheckConfig) -> Evaluated:
-    """Fit camera 0 of a sequence, draw all validation views to `out`, and score them, all by one protocol.
+    """Fit camera 0 of a sequence, render all validation views to `out`, and score them, all by one protocol.
 
     Beside them, scores of the recorded picture of the same time, shown as it is.
 
@@ -43,14 +43,14 @@ def evaluate_dycheck(config: DycheckConfig) -> Evaluated:
         _use_priors(config, sequence)
     scene = timed_reconstruction(seconds, sequence.view, config)
     with timed(seconds, "render"):
-        drawn = render_validation(scene, sequence, config.out / "rgb")
+        rendered = render_validation(scene, sequence, config.out / "rgb")
         alone = render_validation(scene.without_overlay(), sequence)
     with timed(seconds, "score"):
         missing = without_lpips()
         network = None if missing else lpips_network()
         images, without = (
             {name: _score(sequence, name, picture, network) for name, picture in pictures.items()}
-            for pictures in (drawn, alone)
+            for pictures in (rendered, alone)
         )
         shown = sequence.view.rgb.numpy()
         unchanged = [
@@ -82,27 +82,27 @@ def render_validation(
     """The scene through the validation cameras, by picture; written to `out`, if there is one, as <id>.png."""
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-    drawn = {}
+    rendered = {}
     cameras = np.array([name.split("_")[0] for name in sequence.validation])
     for camera in dict.fromkeys(cameras.tolist()):  # each stands still
         mine = np.flatnonzero(cameras == camera)
         frames = torch.tensor([sequence.frames[i] for i in mine])
         pictures = new_pictures(scene, sequence.cameras.select(mine.tolist()), frames)
         for i, picture in zip(mine.tolist(), pictures, strict=True):
-            drawn[sequence.validation[i]] = picture.rgb
+            rendered[sequence.validation[i]] = picture.rgb
             if out is not None:
                 cv2.imwrite(str(out / f"{sequence.validation[i]}.png"), picture.rgb[..., ::-1])
-    return drawn
+    return rendered
 
 
 def _use_priors(config: DycheckConfig, sequence: IphoneSequence) -> None:
     """Takes from Shape of Motion's package what the recipe leaves to be chosen; it is kept in OUT/priors.npz."""
     if sequence.protocol != "som":
         return
-    found = read_priors(sequence, config.fit.max_width)
-    wanted = {name: getattr(found, name) is not None for name in ("masks", "depth", "tracks")}
+    priors = read_priors(sequence, config.fit.max_width)
+    wanted = {name: getattr(priors, name) is not None for name in ("masks", "depth", "tracks")}
     path = config.out / PRIORS_FILE
-    write_exchange(path, found)
+    write_exchange(path, priors)
     for name, there in wanted.items():
         if there and getattr(config.priors, name) == "auto":
             setattr(config.priors, name, str(path))

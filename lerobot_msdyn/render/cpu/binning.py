@@ -13,23 +13,23 @@ _PASSES = 3  # 33 bits, for 32-bit keys
 
 @device
 def _sorted_by_depth(counts, depths):
-    """Indices of the drawn Gaussians from near to far, equal depths by index: a radix sort.
+    """Indices of the visible Gaussians from near to far, equal depths by index: a radix sort.
 
     The bits of positive floats order like the floats themselves. Each key carries its index in its low half.
     """
-    drawn = 0
+    visible = 0
     histogram = np.zeros((_PASSES, _DIGITS), np.int32)
     keys = np.empty(counts.shape[0], np.uint64)
     bits = depths.view(np.uint32)
     for index in range(counts.shape[0]):
         if counts[index] > 0:
             depth = np.uint64(bits[index])
-            keys[drawn] = (depth << np.uint64(32)) | np.uint64(index)
-            drawn += 1
+            keys[visible] = (depth << np.uint64(32)) | np.uint64(index)
+            visible += 1
             for digit in range(_PASSES):
                 place = (depth >> np.uint64(_DIGIT_BITS * digit)) & np.uint64(_DIGITS - 1)
                 histogram[digit, place] += 1
-    other = np.empty(drawn, np.uint64)
+    other = np.empty(visible, np.uint64)
     for digit in range(_PASSES):
         starts = histogram[digit]
         total, most = 0, 0
@@ -38,17 +38,17 @@ def _sorted_by_depth(counts, depths):
             starts[bucket] = total
             total += here
             most = max(most, here)
-        if most == drawn:  # the digit is the same everywhere
+        if most == visible:  # the digit is the same everywhere
             continue
         shift = np.uint64(32 + _DIGIT_BITS * digit)
-        for position in range(drawn):
+        for position in range(visible):
             key = keys[position]
             place = (key >> shift) & np.uint64(_DIGITS - 1)
             other[starts[place]] = key
             starts[place] += 1
         keys, other = other, keys
-    order = np.empty(drawn, np.int32)
-    for position in range(drawn):
+    order = np.empty(visible, np.int32)
+    for position in range(visible):
         order[position] = np.int32(keys[position] & np.uint64(0xFFFFFFFF))
     return order
 

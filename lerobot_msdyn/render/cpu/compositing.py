@@ -101,15 +101,15 @@ def _pass_light(buffer, place, alphas):
     """Let the light of a block through one Gaussian.
 
     Returns:
-        The transmittance before it, its blending weights, and the mask of the pixels where it is drawn.
+        The transmittance before it, its blending weights, and the mask of the pixels where it is shown.
     """
     before = load(buffer, place)
     weight = alphas * before
     after = before - weight
     covers = greater_equal(alphas, splat(_MIN_ALPHA))
-    drawn = both(covers, greater(after, splat(_MIN_TRANSMITTANCE)))
-    store(buffer, place, select(drawn, after, set_sign(before, covers)))
-    return before, select(drawn, weight, zeros()), drawn
+    shown = both(covers, greater(after, splat(_MIN_TRANSMITTANCE)))
+    store(buffer, place, select(shown, after, set_sign(before, covers)))
+    return before, select(shown, weight, zeros()), shown
 
 
 @device
@@ -238,14 +238,14 @@ def _blend_backward(buffer, cell, records, base, left, top, columns, rows, first
             uncapped = exp2(fma(dx, partial, rest))
             alphas = smaller(uncapped, splat(_MAX_ALPHA))
             place = (row * BLOCKS_ACROSS + column) * cell
-            before, weight, drawn = _pass_light(buffer, place, alphas)
+            before, weight, shown = _pass_light(buffer, place, alphas)
             incoming = load_planes(buffer, place + _BACKWARD_HEAD * LANES, layout)
             d_planes = add_weighted(d_planes, weight, incoming)
             light = add_dot(load(buffer, place + 2 * LANES), planes, incoming)
             remaining = fnma(weight, light, load(buffer, place + LANES))
             store(buffer, place + LANES, remaining)
             g = alphas * (before * light - remaining / (splat(_ONE) - alphas))
-            g = select(both(drawn, less(uncapped, splat(_MAX_ALPHA))), g, zeros())
+            g = select(both(shown, less(uncapped, splat(_MAX_ALPHA))), g, zeros())
             slope = fma(xx, dx, partial)
             gx = g * slope
             row_g, row_x, row_xx = row_g + g, row_x + gx, fma(gx, slope, row_xx)

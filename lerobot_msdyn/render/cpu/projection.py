@@ -109,7 +109,7 @@ def _unit_quat(quats, view, index):
 
 @device
 def _usable(mean, scale, inverse_length, opacity):
-    """Whether the numbers of a Gaussian can be drawn (see `check_values`, which reports what is wrong)."""
+    """Whether the numbers of a Gaussian can be rendered (see `check_values`, which reports what is wrong)."""
     finite = _finite(mean[0]) and _finite(mean[1]) and _finite(mean[2])
     sizes = min(scale[0], min(scale[1], scale[2])) >= _ZERO
     sizes = sizes and _finite(scale[0]) and _finite(scale[1]) and _finite(scale[2])
@@ -131,7 +131,7 @@ def project_forward(
     """Project every Gaussian into every view.
 
     Writes per (view, Gaussian): its record (flat), the tiles that it meets (rects `[b, g, 4]`: first x, last x,
-    first y, last y), their number (0: not drawn) and its z-depth. Sets refused[0] if a number cannot be drawn.
+    first y, last y), their number (0: not rendered) and its z-depth. Sets refused[0] if a number cannot be rendered.
     """
     views, count = counts.shape
     channels = features.shape[2]

@@ -37,7 +37,7 @@ def rasterize_cpu(
     height: int,
     near: float,
 ) -> Raster:
-    """Draw Gaussians in float32 with up to 16 feature channels; arguments as in `rasterize`.
+    """Render Gaussians in float32 with up to 16 feature channels; arguments as in `rasterize`.
 
     Raises:
         RenderError: tensors are not float32 on the CPU, there are too many channels, or a value is not finite or
@@ -51,7 +51,7 @@ def rasterize_cpu(
     if features.shape[-1] > MAX_CPU_CHANNELS:
         raise RenderError(
             f"backend 'cpu' got {features.shape[-1]} feature channels; expected at most {MAX_CPU_CHANNELS} "
-            "(draw the others in a second call)"
+            "(render the others in a second call)"
         )
     gaussians = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "features": features}
     cameras = {"camera_from_world": camera_from_world, "intrinsics": intrinsics}
@@ -76,7 +76,7 @@ def _usable(poses: np.ndarray, intrinsics: np.ndarray) -> bool:
 
 
 class _RefusedError(RenderError):
-    """A kernel met a number that cannot be drawn; `check_values` finds out which."""
+    """A kernel met a number that cannot be rendered; `check_values` finds out which."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def _project(inputs: tuple[Tensor, ...], width: int, height: int, near: float, *
         records, rects, counts, depths, refused,
     )  # fmt: skip
     if refused[0]:
-        raise _RefusedError("a Gaussian holds a number that cannot be drawn; backend='reference' may take it")
+        raise _RefusedError("a Gaussian holds a number that cannot be rendered; backend='reference' may take it")
     total = np.cumsum(counts.reshape(-1), dtype=np.int64).reshape(views, count)
     offsets = total - counts
     entries = int(total[-1, -1]) if total.size else 0
