@@ -1,7 +1,7 @@
 """New camera viewpoints for LeRobot datasets; the public names, each imported when it is first used.
 
 Importing this package changes no setting of the process. For speed on a busy machine, set OMP_WAIT_POLICY=PASSIVE
-before torch is imported, as the package's commands do (docs/rasterizer.md).
+before torch is imported, as the package's commands do (docs/render.md).
 """
 
 import importlib

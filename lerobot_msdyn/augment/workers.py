@@ -41,7 +41,7 @@ from lerobot_msdyn.dataset.write import OutputDataset
 from lerobot_msdyn.render.devices import chosen_device
 
 MEMORY_EACH = 3e9  # bytes of a machine's memory that there must be for each worker
-GPU_MEMORY_EACH = 4e9  # bytes of a GPU's free memory; by arithmetic, not measured (docs/gpu.md)
+GPU_MEMORY_EACH = 4e9  # bytes of a GPU's free memory; by arithmetic, not measured (docs/render.md)
 FRAMES_EACH = 200  # of work, for which starting a worker pays
 
 

@@ -229,7 +229,7 @@ class FitConfig:
 
 @dataclass
 class GateConfig:
-    """Which new views are kept: each is judged without ground truth, at a few frames (docs/quality.md)."""
+    """Which new views are kept: each is judged without ground truth, at a few frames (docs/views.md)."""
 
     # Whether views are judged; without, all are kept.
     enabled: bool = True
@@ -257,11 +257,11 @@ class Recipe:
     include_source: bool = True
     # Whether recorded depth of a re-rendered camera is rendered as well; else it is copied, and shows the old view.
     render_depth: bool = True
-    # Whether the reconstructed scenes are kept in the output, for training on views of them (docs/scenes.md).
+    # Whether the reconstructed scenes are kept in the output, for training on views of them (docs/scene.md).
     save_scenes: bool = False
     # Seed of every random choice; together with the episode and the variant it fixes the result.
     seed: int = between(0, 0, MAX_SEED)
-    # auto, cpu or cuda; auto takes a GPU where everything is there to draw on it (docs/gpu.md).
+    # auto, cpu or cuda; auto takes a GPU where everything is there to draw on it (docs/render.md).
     device: Device = "auto"
     # Whether a GPU encodes new H.264 and HEVC videos where it can: faster, but not as the source's encoder would.
     nvenc: bool = False

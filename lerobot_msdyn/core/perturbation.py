@@ -72,7 +72,7 @@ class _Kinds(Mapping[str, type["Perturbation"]]):
 
 @dataclass
 class Perturbation(draccus.ChoiceRegistry):
-    """How the camera of a new episode differs from the recorded one (docs/perturbations.md)."""
+    """How the camera of a new episode differs from the recorded one (docs/views.md)."""
 
     # Whether calibrated cameras move as one body with the first of them; else each changes in its own axes.
     moves_rig: ClassVar[bool] = False

@@ -40,7 +40,7 @@ class Provenance:
         default_factory=dict
     )  # camera -> prior -> provider, why, model
     views: dict[str, dict[str, Any]] = field(default_factory=dict)  # camera -> its `camera_pose`
-    gate: dict[str, Any] = field(default_factory=dict)  # scores and what was rejected, see docs/quality.md
+    gate: dict[str, Any] = field(default_factory=dict)  # scores and what was rejected, see docs/views.md
 
 
 def camera_pose(source: CameraTrack, new: CameraTrack) -> dict[str, Any]:

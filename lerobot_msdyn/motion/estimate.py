@@ -66,7 +66,7 @@ def scene_motion(
 
 
 def motion_from_tracks(tracks: LiftedTracks, config: MotionConfig, recording: Recording | None = None) -> SceneMotion:
-    """All levels of motion (the paper's section on initialisation; docs/method.md), from at least one track.
+    """All levels of motion (the paper's section on initialisation; docs/motion.md), from at least one track.
 
     Raises:
         ConfigError: the levels cannot stand in this order, or a setting is not allowed.

@@ -33,7 +33,7 @@ _BESIDE = np.ones((3, 3), np.uint8)  # a pixel and those beside it
 
 
 def unexplained(scene: DynamicScene, view: View, priors: Priors, backend: str = "auto") -> Overlay:
-    """The patches of all frames that make the recorded camera see what it recorded (docs/fit.md, "Overlay").
+    """The patches of all frames that make the recorded camera see what it recorded (docs/reconstruction.md, "Overlay").
 
     A pixel is unexplained where the drawn picture has another colour or depth than the recorded one. There the frame's
     own pixels are put at their recorded depth, for this frame alone, and Gaussians of the scene in front of that

@@ -1,4 +1,4 @@
-"""The rasterizer for CUDA devices: gsplat, called so that it means the same as the reference (docs/gpu.md)."""
+"""The rasterizer for CUDA devices: gsplat, called so that it means the same as the reference (docs/render.md)."""
 
 import torch
 from gsplat import rasterization

@@ -43,7 +43,7 @@ def patched(snapshot: Snapshot, patch: FramePatch) -> Snapshot:
 
 @dataclass(frozen=True)
 class DynamicScene:
-    """A static set, a moving set in its canonical frame, and the levels of motion that carry it (docs/method.md)."""
+    """A static set, a moving set in its canonical frame, and the levels of motion that carry it (docs/motion.md)."""
 
     static: Gaussians
     moving: Gaussians

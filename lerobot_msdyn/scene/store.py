@@ -1,4 +1,4 @@
-"""One camera's reconstruction on disk: its scenes, its camera and what was known of them (docs/scenes.md)."""
+"""One camera's reconstruction on disk: its scenes, its camera and what was known of them (docs/scene.md)."""
 
 import json
 import shutil
@@ -147,7 +147,7 @@ def read_header(folder: Path) -> dict[str, Any]:
         schema = header["schema"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise MsdynError(
-            f"{path}: not the header of a saved scene ({type(error).__name__}: {error}); docs/scenes.md has the format"
+            f"{path}: not the header of a saved scene ({type(error).__name__}: {error}); docs/scene.md has the format"
         ) from error
     if schema != FOLDER_SCHEMA:
         raise MsdynError(f"{path}: schema is {schema}; expected {FOLDER_SCHEMA}; make it again with --save_scenes true")

@@ -66,7 +66,7 @@ def test_positions_do_not_depend_on_the_worlds_origin() -> None:
 
 
 def test_a_point_on_a_hinge_stays() -> None:
-    """Two bases that turn by +20 and -20 degrees about a common hinge, mixed half and half (docs/method.md)."""
+    """Two bases that turn by +20 and -20 degrees about a common hinge, mixed half and half (docs/motion.md)."""
     hinge = torch.tensor([0.7, 0.0, 0.0])
     angle = torch.tensor([0.0, 0.0, math.radians(20)])
     motions = torch.stack((turn_about(hinge, angle), turn_about(hinge, -angle)))[:, None]

@@ -33,7 +33,7 @@ def fit_rigid(
     """Rigid motion of each of h groups; `weights` (0 = not a member, or not seen) say which tracks it may use.
 
     From the frame with most tracks outward, each frame is registered to a model of all tracks met so far, so that
-    tracks need not share a frame (docs/method.md, level 1). Then model and motions are refined in turn (generalised
+    tracks need not share a frame (docs/motion.md, level 1). Then model and motions are refined in turn (generalised
     Procrustes analysis with missing data). All fits are robust (iterated Geman-McClure weights).
 
     `carry` is the motion of whatever carries a group while the group itself cannot be followed: with it, tracks that

@@ -21,7 +21,7 @@ _DEGENERATE = 1e-3  # area spanned by the first two columns of a blend, below wh
 
 @dataclass(frozen=True)
 class MotionLevel:
-    """K rigid motions over time (docs/method.md): A_k,t(x) = R_k,t (x - p_k) + p_k + d_k,t.
+    """K rigid motions over time (docs/motion.md): A_k,t(x) = R_k,t (x - p_k) + p_k + d_k,t.
 
     Displacements are those of the pivot, so rotations and displacements are decoupled and both small; at the
     canonical frame every basis is the identity. Between its knots a motion is interpolated linearly, beyond them held.

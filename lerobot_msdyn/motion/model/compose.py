@@ -1,4 +1,4 @@
-"""Where the Gaussians are at a time: the finest motion first, then the coarser ones that carry it (docs/method.md)."""
+"""Where the Gaussians are at a time: the finest motion first, then the coarser ones that carry it (docs/motion.md)."""
 
 from typing import ClassVar, Protocol, runtime_checkable
 

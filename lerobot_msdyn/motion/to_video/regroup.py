@@ -33,7 +33,7 @@ class Grouping:
 
 
 def regroup(video: Video, points: Sightings, start: Grouping, max_parts: int) -> Grouping:
-    """Parts and motions that explain the video best, in turn (docs/method.md, "Registration").
+    """Parts and motions that explain the video best, in turn (docs/motion.md, "Registration").
 
     Every part is halved, both halves are aligned and all points choose anew; then parts are given up, the least useful
     first, while that costs little or an instance has more than `max_parts`.
