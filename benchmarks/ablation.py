@@ -143,7 +143,8 @@ def reconstructed(prepared: Prepared, row: Row, recipe: Recipe) -> Reconstructio
         draft.empty, draft.distance = prepared.empty, look_at_distance(prepared.empty.depth)
 
     def fitted(draft: Draft) -> None:
-        scene, learned = draft.scene, []
+        scene = draft.scene
+        learned: list[dict[str, Any]] = []
         if row.learned:
             scene, learned = with_learned_motion(scene, draft.distance, afresh=row.learned == "afresh")
         draft.fitted = fit(

@@ -1,7 +1,7 @@
 """What the ablation compares with that the library does not have: pictures warped by depth, and learned motion."""
 
 from collections.abc import Iterator
-from dataclasses import fields, replace
+from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
 import cv2
@@ -14,6 +14,7 @@ from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.geometry import project, transform_points, unproject_image
+from lerobot_msdyn.motion.model.compose import Level
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.reconstruction.background import EmptyScene
 from lerobot_msdyn.scene.dynamic import DynamicScene
@@ -73,13 +74,16 @@ def closed(colours: Float32[ndarray, "h w 3"], weight: Float32[ndarray, "h w"]) 
     """A splat whose cracks of a pixel or two are closed, so that nothing shines through them."""
     for _ in range(2):
         covered: Bool[ndarray, "h w"] = weight > LEAST_WEIGHT
-        window = {"ddepth": -1, "ksize": (3, 3), "normalize": False, "borderType": cv2.BORDER_CONSTANT}
-        count = cv2.boxFilter(covered.astype(np.float32), **window)
+        count = _sum_of_window(covered.astype(np.float32))
         crack = ~covered & (count >= CRACK_NEIGHBOURS)
-        mean = cv2.boxFilter(np.where(covered[..., None], colours, np.float32(0)), **window)
+        mean = _sum_of_window(np.where(covered[..., None], colours, np.float32(0)))
         colours = np.where(crack[..., None], mean / np.maximum(count, 1)[..., None], colours)
         weight = np.where(crack, np.float32(1), weight)
     return colours, weight
+
+
+def _sum_of_window(image: ndarray) -> ndarray:
+    return cv2.boxFilter(image, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
 
 
 def with_learned_motion(
@@ -93,8 +97,10 @@ def with_learned_motion(
         "bases": {"rotations_6d": TURN_RATE, "displacements": SHIFT_RATE * distance},
         "field": dict.fromkeys(("first", "hidden", "biases", "last"), FIELD_RATE),
     }
-    levels, groups = [], []
+    levels: list[Level] = []
+    groups: list[dict[str, Any]] = []
     for level in scene.levels:
+        assert is_dataclass(level)
         rates = rates_of[level.kind]
         leaves = {name: getattr(level, name).clone() for name in rates}
         if afresh:
@@ -106,8 +112,8 @@ def with_learned_motion(
 
 def with_fixed_motion(scene: DynamicScene) -> DynamicScene:
     """The same scene after the fit: nothing is learned any more."""
-    levels = (
-        replace(level, **{item.name: getattr(level, item.name).detach() for item in fields(level)})
-        for level in scene.levels
-    )
+    levels: list[Level] = []
+    for level in scene.levels:
+        assert is_dataclass(level)
+        levels.append(replace(level, **{item.name: getattr(level, item.name).detach() for item in fields(level)}))
     return replace(scene, levels=tuple(levels))

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -50,7 +51,7 @@ def corrupted(view: View, recipe: Recipe, corruption: str, priors: Priors, folde
     """The case of one corruption; `priors` are those of the uncorrupted video, `folder` is where files may be put."""
     rng = np.random.default_rng(0)
     path = folder / f"{corruption}.npz"
-    known = {"masks": str(path), "tracks": str(path)}
+    known: dict[str, Any] = {"masks": str(path), "tracks": str(path)}
     if corruption == "wrong_depth":
         assert view.depth is not None
         priors = replace(priors, depth=torch.from_numpy(wrong_depth(view.depth.numpy(), rng)))

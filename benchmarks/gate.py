@@ -161,7 +161,7 @@ def summary(rows: list[Row]) -> dict[str, float]:
 def spearman(one: np.ndarray, other: np.ndarray) -> float:
     """Rank correlation; ties are as good as absent between measured values."""
     ranks = [np.argsort(np.argsort(values)) for values in (one, other)]
-    return float(np.corrcoef(*ranks)[0, 1])
+    return float(np.corrcoef(ranks)[0, 1])
 
 
 if __name__ == "__main__":

@@ -141,7 +141,7 @@ def compare_routes(gaussians: int, times: int, scale: int, rounds: int) -> dict:
             dense.forward_backward()
 
     ms = medians([sparse.forward_backward, dense.forward_backward, by_matrix], rounds)
-    row = {"gaussians": gaussians, "times": times, "scale": scale}
+    row: dict[str, int | float] = {"gaussians": gaussians, "times": times, "scale": scale}
     row |= {f"{name}_ms": round(value, 2) for name, value in zip(("sparse", "dense", "matrix"), ms, strict=True)}
     return row | {"dense_ratio": round(ms[1] / ms[0], 2), "matrix_ratio": round(ms[2] / ms[0], 2)}
 
@@ -151,7 +151,10 @@ def growth(gaussians: int, rounds: int) -> list[dict]:
     settings = [{"times": t} for t in (1, 2, 5)] + [{"gaussians": gaussians * k // 4} for k in (1, 16)]
     settings += [{"scale": scale} for scale in (2, 4)]
     complete = [{"gaussians": gaussians, "times": 1, "scale": 1} | setting for setting in settings]
-    ms = medians([make_load(**setting).forward_backward for setting in complete], rounds)
+    ms = medians(
+        [make_load(setting["gaussians"], setting["times"], setting["scale"]).forward_backward for setting in complete],
+        rounds,
+    )
     return [
         setting | {"sparse_ms": round(value, 2), "relative": round(value / ms[0], 2)}
         for setting, value in zip(complete, ms, strict=True)
@@ -275,8 +278,8 @@ def main(words: list[str] | None = None) -> None:
     if only in (None, "time"):
         gaussians, rounds = (200, 1) if quick else (20_000, arguments.rounds)
         settings = ((1, 1), (5, 1), (1, 4))
-        rows = (compare_routes(gaussians, times, scale, rounds) for times, scale in settings)
-        report["time"] = printed(f"sparse against dense; demanded: {LEAST_RATIO:.0f} times", rows)
+        compared = (compare_routes(gaussians, times, scale, rounds) for times, scale in settings)
+        report["time"] = printed(f"sparse against dense; demanded: {LEAST_RATIO:.0f} times", compared)
         report["growth"] = printed("growth of the sparse time", growth(gaussians, rounds))
     if only in (None, "tracks"):
         tracks, frames, variants = (60, 8, hierarchies[:2]) if quick else (3000, 60, list(VARIANTS))

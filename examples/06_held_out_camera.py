@@ -20,7 +20,10 @@ def psnr_db(folder: Path, truth: Path) -> float:
     """Mean over the pictures of a folder."""
     values = []
     for path in sorted(folder.glob("*.png")):
-        difference = cv2.imread(str(path)).astype(float) - cv2.imread(str(truth / path.name))
+        rendered, true = cv2.imread(str(path)), cv2.imread(str(truth / path.name))
+        assert rendered is not None
+        assert true is not None
+        difference = rendered.astype(float) - true
         values.append(10 * np.log10(255**2 / (difference**2).mean()))
     return float(np.mean(values))
 

@@ -69,7 +69,8 @@ def main() -> None:
     flags |= {"motion.levels": "[object,cell]", "motion.settings.cell.side_m": 0.04, "motion.gate": "false"}
     augment.run([f"--{name}={value}" for name, value in flags.items()])
     window = store.load(store.list_scenes(arguments.out / "desk_msdyn")[0][CAMERA]).windows[0]
-    print(f"{len(window.levels[0])} parts, {len(window.levels[1])} cells, {len(window.moving)} moving Gaussians")
+    parts, cells = (level for level in window.levels if isinstance(level, MotionLevel))
+    print(f"{len(parts)} parts, {len(cells)} cells, {len(window.moving)} moving Gaussians")
 
 
 if __name__ == "__main__":

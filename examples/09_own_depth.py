@@ -61,8 +61,9 @@ def main() -> None:
     write_dataset([make_scene("push", 0, arguments.frames, 160, 120)], "local/desk", root)
     flags = {"repo": "local/desk", "root": root, "plugins": __file__, "priors.depth": "two_walls", "variants": 1}
     augment.run([f"--{name}={value}" for name, value in (flags | {"fit.steps": arguments.steps}).items()])
-    new_episode = read_provenance(arguments.out / "desk_msdyn")[-1]
-    print(json.loads(new_episode["priors"])[CAMERA]["depth"])
+    episodes = read_provenance(arguments.out / "desk_msdyn")
+    assert episodes is not None
+    print(json.loads(episodes[-1]["priors"])[CAMERA]["depth"])
 
 
 if __name__ == "__main__":

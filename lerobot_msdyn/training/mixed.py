@@ -2,7 +2,7 @@
 
 import copy
 import os
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 import torch
@@ -71,6 +71,10 @@ class MixedViews(torch.utils.data.Dataset):
         """Tell it, and workers that run already, which epoch it is; from then on samples are seen from elsewhere."""
         self.mixer.set_epoch(epoch)
 
+    @overload
+    def __getitem__(self, index: int) -> dict[str, Any]: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[dict[str, Any]]: ...
     def __getitem__(self, index: int | slice) -> dict[str, Any] | list[dict[str, Any]]:
         """One sample, or those of a slice."""
         if isinstance(index, slice):

@@ -4,7 +4,9 @@ import dataclasses
 import html.parser
 import json
 import re
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -16,7 +18,10 @@ from lerobot_msdyn.augment.report import build
 from lerobot_msdyn.augment.report.drawing import cameras_from_above
 from lerobot_msdyn.augment.report.page import LISTED, Pictures, ViewEntry, page
 from lerobot_msdyn.augment.report.pictures import data_url, film, heat_map, spread, strip
+from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.reconstruction.account import Account, account_sentence
+from lerobot_msdyn.reconstruction.result import FittedWindow
+from lerobot_msdyn.views.gate import Scores
 
 FRONT = "observation.images.front"
 FAST = ("--fit.steps", "4", "--scene.moving_gaussians", "500", "--scene.moving_frames", "4", "--fit.max_width", "48")
@@ -81,7 +86,7 @@ def outline(text: str) -> Outline:
     return found.finished()
 
 
-def entry(episode: int = 0, **changes: object) -> ViewEntry:
+def entry(episode: int = 0, **changes: Any) -> ViewEntry:
     view = {"camera_from_source": np.eye(4).tolist(), "distance_m": 0.6, "what_moves": WHAT_MOVES, "scores": SCORES}
     plain = ViewEntry(episode, 0, FRONT, {"azimuth_deg": 3.0, "shift_x_m": 0.01}, view, [], dropped=False)
     return dataclasses.replace(plain, **changes)
@@ -123,7 +128,7 @@ def test_it_says_what_renders_what_moves() -> None:
     assert f"{FRONT}: of the pixels that show something moving, 60 % are rendered by motion, 39 % are recorded" in text
     assert "PSNR is 28.4 dB, and 19.6 dB without the overlay" in text
     assert text.count("<td>30%</td><td>68%</td><td>28.4 dB</td><td>19.6 dB</td>") == 2
-    nothing = WHAT_MOVES | {"pixels": 0, "by_motion": 0.0, "by_overlay": 0.0, "by_background": 0.0}
+    nothing: dict[str, Any] = WHAT_MOVES | {"pixels": 0, "by_motion": 0.0, "by_overlay": 0.0, "by_background": 0.0}
     nothing |= {"dynamic_db": None, "dynamic_without_overlay_db": None}
     still = page("ds", {}, [entry(0, view=entry().view | {"what_moves": nothing})], [])
     assert "nothing moves in the frames that were checked" in still
@@ -196,10 +201,10 @@ def test_report_and_record_agree_on_what_renders_what_moves(reported: Path) -> N
 def test_what_the_gate_rejects_is_drawn_again_and_then_dropped(
     desk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    drawn = []
+    drawn: list[CameraTrack] = []
     judge = episodes.judge
 
-    def counted(windows: object, camera: object) -> object:
+    def counted(windows: Sequence[FittedWindow], camera: CameraTrack) -> Scores:
         drawn.append(camera)
         scores = judge(windows, camera)
         return dataclasses.replace(scores, expected_db=1.0) if len(drawn) in (1, 2, 3, 4) else scores

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
@@ -149,7 +150,7 @@ def test_they_stand_alone() -> None:
 
 
 def test_wrong_settings_are_named(field: ModuleType) -> None:
-    wrong = [
+    wrong: list[tuple[dict[str, dict[str, Any]], str]] = [
         ({"flat": {"bases": 0}}, r"settings\.flat\.bases is 0; expected a value from 1 to 10000"),
         ({"flat": {"basis": 3}}, r"settings\.flat: .*`basis` are not valid"),
         ({"flat": {"bases": "many"}}, r"settings\.flat: `bases`: Couldn't parse 'many'"),

@@ -94,12 +94,11 @@ def test_scores_agree_with_the_scorer_of_the_data(shared_data: Path) -> None:
     truth = read_truth(shared_data / "sim" / "rigid_push", "az+05")
     assert truth is not None
     assert truth.moving is not None
-    some = TrueViews(truth.rgb[8:10], truth.seen[8:10], truth.moving[8:10])
+    moving = truth.moving[8:10]
+    some = TrueViews(truth.rgb[8:10], truth.seen[8:10], moving)
     noise = np.random.default_rng(0).normal(0, 12, some.rgb.shape)
     drawn = (some.rgb + noise).clip(0, 255).astype(np.uint8)
     found = score_views(drawn, some)
-    theirs = [
-        scorer.score_frame(drawn[i], some.rgb[i], some.seen[i], some.moving[i].astype(int), [1]) for i in range(2)
-    ]
+    theirs = [scorer.score_frame(drawn[i], some.rgb[i], some.seen[i], moving[i].astype(int), [1]) for i in range(2)]
     for name in ("psnr", "ssim", "dyn_psnr", "dyn_ssim", "dis_psnr"):
         assert found[name] == pytest.approx(np.mean([one[name] for one in theirs]), abs=1e-4), name

@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 import torch
+from motion_levels import of_bases
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import static_camera
@@ -67,7 +68,7 @@ def test_the_gate_keeps_what_proves_itself(by_levels) -> None:
 def test_a_rigid_body_gets_no_finer_levels() -> None:
     body = tracked_body("rigid")
     motion = fitted(body, "object", "primitive", "grain")
-    assert [bool(level.active.any()) for level in motion.levels] == [True, False, False]
+    assert [bool(level.active.any()) for level in of_bases(motion.levels)] == [True, False, False]
     assert error_mm(motion, body) < 0.3
     assert error_mm(fitted(body, "object", "primitive", "grain", gate=False), body) > error_mm(motion, body)
 
@@ -121,7 +122,7 @@ def test_late_arrivals_leavers_and_gaps(tumbling, late) -> None:
 def test_nothing_moves(resting) -> None:
     xyz = resting.xyz + 2e-4 * torch.randn(60, 24, 3, generator=torch.Generator().manual_seed(0))
     motion = motion_from_tracks(lifted(xyz), MotionConfig())
-    assert not any(bool(level.active.any()) for level in motion.levels)
+    assert not any(bool(level.active.any()) for level in of_bases(motion.levels))
 
 
 def test_one_track_is_enough() -> None:
@@ -143,9 +144,10 @@ def test_from_the_image_to_the_motion() -> None:
         tracks, torch.full((frames, 48, 64), 2.0), static_camera(K, frames, 64, 48), MotionConfig(levels=["object"])
     )
     assert motion is not None
-    assert len(motion.levels[0]) == 1
+    (level,) = of_bases(motion.levels)
+    assert len(level) == 1
     shift = (torch.arange(frames) - motion.canonical_frame)[:, None] * torch.tensor([0.02, 0.0, 0.0])
-    torch.testing.assert_close(motion.levels[0].displacements[0], shift, atol=1e-5, rtol=0)
+    torch.testing.assert_close(level.displacements[0], shift, atol=1e-5, rtol=0)
 
 
 def test_without_usable_tracks_there_is_no_motion() -> None:

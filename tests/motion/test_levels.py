@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from motion_levels import of_bases
 from torch import Tensor
 
 from lerobot_msdyn.augment import __main__ as augment
@@ -133,21 +134,23 @@ def test_a_finer_level_of_ones_own_explains_more(body: TrackedBody) -> None:
     coarse = fitted(body, MotionConfig(levels=["object"], max_parts=1))
     own = fitted(body, MotionConfig(levels=["object", "halves"], max_parts=1, gate=False))
     assert own.names == ("object", "halves")
-    assert len(own.levels[1]) == 2
+    halves = of_bases(own.levels)[1]
+    assert len(halves) == 2
     assert error_mm(own, body) < 0.9 * error_mm(coarse, body)
-    steps = own.levels[1].knots.diff()
+    steps = halves.knots.diff()
     assert int(steps.max()) == 3
     often = MotionConfig(levels=["object", "halves"], max_parts=1, gate=False, frames_per_knot={"halves": 1})
-    assert int(fitted(body, often).levels[1].knots.diff().max()) == 1
+    assert int(of_bases(fitted(body, often).levels)[1].knots.diff().max()) == 1
 
 
 def test_a_first_level_of_ones_own(body: TrackedBody) -> None:
     whole = fitted(body, MotionConfig(levels=["whole"]))
     objects = fitted(body, MotionConfig(levels=["object"]))
-    assert torch.equal(whole.levels[0].displacements, objects.levels[0].displacements)
+    (level,), (expected,) = of_bases(whole.levels), of_bases(objects.levels)
+    assert torch.equal(level.displacements, expected.displacements)
     assert set(whole.bind(whole.points, whole.part)[0][0].flatten().tolist()) == {0}
     frame = torch.tensor([7])
-    first = level_affines(whole.levels[0], frame)[0, 0]
+    first = level_affines(level, frame)[0, 0]
     moved, _ = whole.moved(whole.points, whole.part, frame)
     torch.testing.assert_close(moved[0], whole.points @ first[:, :3].T + first[:, 3], atol=1e-5, rtol=0)
     back, _ = whole.to_canonical(moved[0], 7, whole.instance)
@@ -157,7 +160,7 @@ def test_a_first_level_of_ones_own(body: TrackedBody) -> None:
 def test_grains_follow_those_of_the_nearest_primitives(body: TrackedBody) -> None:
     motion = fitted(body, MotionConfig(max_parts=1, gate=False))
     indices, logits = bind(motion.names, motion.levels, motion.points, motion.part)
-    grains = motion.levels[2]
+    grains = of_bases(motion.levels)[2]
     idle = len(grains) - 1
     assert (indices[2][:, -1] == idle).all()
     assert (logits[2][:, -1] == -4).all()
@@ -186,7 +189,7 @@ def test_a_plugin_gives_an_episode_its_own_level(desk: Path, tmp_path: Path) -> 
     }
     assert augment.run([f"--{name}={value}" for name, value in flags.items()]) == 0
     (window,) = store.load(store.list_scenes(tmp_path / "new")[0][FRONT]).windows
-    objects, cells = window.levels
+    objects, cells = of_bases(window.levels)
     assert len(window.moving) > 0
     assert len(cells) > len(objects)
     assert (cells.parents >= 0).all()

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from motion_levels import of_bases
 
 from lerobot_msdyn.core.config import MotionConfig
 from lerobot_msdyn.core.geometry import invert_se3
@@ -78,7 +79,7 @@ def test_registration_corrects_disturbed_poses(
 
 
 def test_canonical_frame_stays_the_identity(registered: SceneMotion) -> None:
-    at_canonical = level_affines(registered.levels[0], torch.tensor([CANONICAL]))[:, 0]
+    at_canonical = level_affines(of_bases(registered.levels)[0], torch.tensor([CANONICAL]))[:, 0]
     torch.testing.assert_close(at_canonical, torch.eye(3, 4).expand_as(at_canonical), atol=1e-5, rtol=0)
 
 
@@ -99,10 +100,11 @@ def test_a_worse_motion_is_refused(
 
 
 def test_a_level_that_disagrees_with_the_video_is_not_approved(recording: Recording, registered: SceneMotion) -> None:
-    count = len(registered.levels[0])
+    (level,) = of_bases(registered.levels)
+    count = len(level)
     motions = torch.eye(4).repeat(count, FRAMES, 1, 1)
     approve = recording.approval(registered, "primitive")
-    parents, pivots = torch.arange(count), registered.levels[0].pivots
+    parents, pivots = torch.arange(count), level.pivots
     still = level_from_motions(motions, pivots, parents=parents, canonical=CANONICAL)
     motions[:, 1::2, 2, 3] = 0.03
     shaken = level_from_motions(motions, pivots, parents=parents, canonical=CANONICAL)
@@ -112,9 +114,10 @@ def test_a_level_that_disagrees_with_the_video_is_not_approved(recording: Record
 
 
 def test_inactive_parts_stay(recording: Recording, disturbed: SceneMotion) -> None:
-    still = replace(disturbed.levels[0], active=torch.zeros_like(disturbed.levels[0].active))
+    (level,) = of_bases(disturbed.levels)
+    still = replace(level, active=torch.zeros_like(level.active))
     found = recording.register(replace(disturbed, levels=(still,)), MotionConfig())
-    assert not bool(found.levels[0].active.any())
+    assert not bool(of_bases(found.levels)[0].active.any())
 
 
 def test_without_depth_there_is_no_recording(scene: SyntheticScene, view: SyntheticView) -> None:

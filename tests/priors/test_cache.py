@@ -69,7 +69,8 @@ def test_a_damaged_file_is_computed_again(tmp_path: Path, damage: str, caplog: p
     content = bytearray(path.read_bytes())
     if damage == "flipped":
         content[len(content) // 2] ^= 255
-    path.write_bytes({"cut": content[: len(content) // 2], "flipped": content, "empty": b""}[damage])
+    damaged: dict[str, bytes | bytearray] = {"cut": content[: len(content) // 2], "flipped": content, "empty": b""}
+    path.write_bytes(damaged[damage])
     with caplog.at_level(logging.WARNING):
         assert cache.get("depth", "plane", {}, compute)["x"][0] == 2
     assert "damaged" in caplog.text

@@ -36,7 +36,7 @@ def content() -> dict[str, np.ndarray]:
 
 
 def save(path: Path, arrays: dict[str, np.ndarray]) -> Path:
-    np.savez(path, **arrays)
+    np.savez(path, **arrays)  # type: ignore[arg-type]  # no array is called allow_pickle
     return path
 
 
@@ -83,7 +83,7 @@ def test_a_single_k_holds_for_all_frames_and_unseen_points_may_be_nan(tmp_path: 
     assert np.isfinite(read.tracks).all()
 
 
-BAD = {
+BAD: dict[str, tuple[dict[str, np.ndarray], str]] = {
     "another episode": ({"episode": np.array(4)}, "is of episode 4, not 3: it belongs to another video"),
     "another camera": ({"camera": np.array("observation.images.side")}, "is of camera .*side, not .*front"),
     "another length": ({"frames": np.array(9)}, "is of 9 frames, the episode has 5: of another episode"),

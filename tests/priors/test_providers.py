@@ -110,7 +110,7 @@ def test_depth_that_holds_nothing_is_named_and_auto_goes_on(view: View, caplog: 
 )
 def test_what_was_asked_for_and_is_absent_is_named(view: View, config: dict[str, str], message: str) -> None:
     with pytest.raises(PriorError, match=message):
-        estimate(view, **config)
+        estimate(view, None, **config)
 
 
 def test_recorded_depth_must_be_there(view: View) -> None:
@@ -156,7 +156,7 @@ def test_what_a_file_lacks_is_named(view: View, tmp_path: Path) -> None:
     file = exchange(tmp_path / "x.npz", frames=FRAMES)
     for prior in ("depth", "masks", "tracks"):
         with pytest.raises(PriorError, match=rf"priors.{prior}: .*x\.npz has no array"):
-            estimate(view, **{prior: file})
+            estimate(view, None, **{prior: file})
     with pytest.raises(PriorError, match="has neither K nor w2c"):
         estimate(view, CameraConfig(poses=file))
 

@@ -56,7 +56,7 @@ def test_bad_weights_are_named(tmp_path: Path) -> None:
 
 
 def test_the_tracker_uses_the_flow_that_it_is_given(sliding) -> None:
-    sizes = set()
+    sizes: set[tuple[int, ...]] = set()
 
     def still(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         sizes.update((a.shape, b.shape))

@@ -59,8 +59,9 @@ def test_a_folder_with_something_else_is_named(tmp_path: Path, video) -> None:
     (tmp_path / "model.safetensors").write_bytes(b"")
     model = find_model(str(tmp_path))
     assert model is not None
+    rgb, prompts = video
     with pytest.raises(PriorError, match="cannot be loaded as a SAM 2 video model"):
-        sam2_masks(*video, model, "cpu")
+        sam2_masks(rgb, prompts, model, "cpu")
 
 
 def test_the_best_frame_shows_a_whole_thing_of_the_usual_size() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from lerobot_msdyn.core.cameras import intrinsics_from_fov, static_camera
-from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.core.observations import DepthTraits, View
 from lerobot_msdyn.priors import PointTracks, Priors
 from lerobot_msdyn.priors.sheet import PALETTE, contact_sheet, depth_range, draw_depth
 
@@ -16,7 +16,7 @@ def priors_of(view: View, depth: torch.Tensor) -> Priors:
     instances[:, 10:20, 10:20] = 1
     visible = torch.arange(frames)[None] < frames // 2
     tracks = PointTracks(torch.full((1, frames, 2), 15.0), visible, visible.float(), torch.ones(1, dtype=torch.int64))
-    return Priors(depth, instances, tracks, True, {"masks": {"provider": "change"}})
+    return Priors(depth, instances, tracks, DepthTraits(metric=True), {"masks": {"provider": "change"}})
 
 
 def test_every_camera_has_four_rows_of_pictures(sliding) -> None:

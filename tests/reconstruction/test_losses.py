@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from jaxtyping import Float
-from test_fit import grey_scene, still_video
+from still_video import grey_scene, still_video
 from torch import Tensor
 
 from lerobot_msdyn.augment.config import AugmentConfig

@@ -133,6 +133,7 @@ def test_an_episode_keeps_its_own_gaussians_where_its_background_is_another() ->
     (shared,) = shared_by([view, episode(20, texture()), episode(40, texture())], texture())
     static = background_gaussians(shared.empty.rgb, shared.empty.depth, view.camera, 10_000)
     shared = dataclasses.replace(shared, static=dataclasses.replace(static, means=static.means + 1))  # to tell them
+    assert view.depth is not None
     own = empty_scene(view.rgb, view.depth, torch.zeros(FRAMES, HEIGHT, WIDTH, dtype=torch.uint8))
     fresh = background_gaussians(own.rgb, own.depth, view.camera, 10_000)
     mixed = adapted(shared, own, fresh).means.reshape(HEIGHT, WIDTH, 3)

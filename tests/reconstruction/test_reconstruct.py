@@ -14,8 +14,9 @@ from lerobot_msdyn.core.observations import DepthTraits, View
 from lerobot_msdyn.dataset.read import open_source
 from lerobot_msdyn.priors import Priors, estimate_priors
 from lerobot_msdyn.reconstruction import reconstruct as pipeline
-from lerobot_msdyn.reconstruction.reconstruct import Picture, new_pictures, reconstruct
+from lerobot_msdyn.reconstruction.reconstruct import reconstruct
 from lerobot_msdyn.synthetic import make_scene
+from lerobot_msdyn.views.pictures import Picture, new_pictures
 
 FRAMES, WIDTH, HEIGHT = 12, 64, 48
 

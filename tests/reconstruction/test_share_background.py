@@ -8,7 +8,7 @@ import torch
 from lerobot_msdyn.augment.backgrounds import shared_backgrounds
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import PriorError
-from lerobot_msdyn.dataset.read import open_source
+from lerobot_msdyn.dataset.read import open_source, read_episode
 from lerobot_msdyn.reconstruction import share_background as sharing
 from lerobot_msdyn.reconstruction.windows import windows
 
@@ -56,7 +56,7 @@ def test_an_episode_without_masks_is_left_out(desk: Path, tmp_path: Path, monkey
 def test_windows_are_of_about_equal_length(desk: Path, tmp_path: Path) -> None:
     settings = recipe(tmp_path)
     settings.fit.window_frames = 5
-    view = sharing.read_episode(open_source("local/desk", desk), 0, [FRONT], settings.camera).views[FRONT]
+    view = read_episode(open_source("local/desk", desk), 0, [FRONT], settings.camera).views[FRONT]
     parts = windows(view, settings)
     assert [start for start, _ in parts] == [0, 4, 8]
     assert [len(part.rgb) for _, part in parts] == [4, 4, 4]

@@ -1,5 +1,6 @@
 """The .ply layout of 3D Gaussian Splatting, out and back."""
 
+from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -94,7 +95,7 @@ def test_frames_of_a_scene(desk_scenes: Path, tmp_path: Path) -> None:
         (lambda content: content.replace(b"property float x", b"property uchar x"), "float properties alone"),
     ],
 )
-def test_other_files_are_refused(tmp_path: Path, change: object, message: str) -> None:
+def test_other_files_are_refused(tmp_path: Path, change: Callable[[bytes], bytes], message: str) -> None:
     path = tmp_path / "a.ply"
     save_ply(some_gaussians(), path)
     path.write_bytes(change(path.read_bytes()))

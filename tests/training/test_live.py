@@ -1,5 +1,6 @@
 """Frames that are rendered for training are those of the renderer."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
@@ -9,7 +10,7 @@ import pytest
 import torch
 
 from lerobot_msdyn.core.geometry import axis_angle_to_matrix, se3
-from lerobot_msdyn.motion.model.bases import level_from_motions
+from lerobot_msdyn.motion.model.bases import MotionLevel, level_from_motions
 from lerobot_msdyn.scene import store as saved
 from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.rendering import render_scene
@@ -28,7 +29,7 @@ def turning(scene: DynamicScene, bases: int = 3) -> DynamicScene:
     generator = torch.Generator().manual_seed(0)
     count = len(scene.moving)
 
-    def level(size: float) -> object:
+    def level(size: float) -> MotionLevel:
         turns = size * torch.randn(bases, scene.frames, 3, generator=generator)
         turns[1:2, 1:] = torch.tensor([0.0, 0.0, torch.pi])
         shifts = 0.1 * torch.randn(bases, scene.frames, 3, generator=generator)
@@ -69,7 +70,9 @@ def drifting(scene: DynamicScene) -> DynamicScene:
 
 
 @pytest.mark.parametrize("change", [lambda scene: scene, turning, drifting], ids=["fitted", "turning", "drifting"])
-def test_the_same_picture_as_that_of_the_renderer(scene: SavedScene, change: object) -> None:
+def test_the_same_picture_as_that_of_the_renderer(
+    scene: SavedScene, change: Callable[[DynamicScene], DynamicScene]
+) -> None:
     scene = replace(scene, windows=tuple(change(window) for window in scene.windows))
     frames = torch.tensor([2, 8, 9])
     recorded = scene.camera.select(frames)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -38,20 +39,18 @@ def scene(
     return SavedScene(SceneSource("local/none", 0, "a", 30), (), (), camera, metric, DISTANCE, {})
 
 
-def change(
-    config: Perturbation, variant: int = 0, *, seed: int = 0, episode: int = 1, **of_scene: object
-) -> CameraChange:
+def change(config: Perturbation, variant: int = 0, *, seed: int = 0, episode: int = 1, **of_scene: Any) -> CameraChange:
     return sample_change(config, {"a": scene(**of_scene)}, seed, episode, variant)
 
 
-def amounts(config: Perturbation, variant: int = 0, **options: object) -> torch.Tensor:
+def amounts(config: Perturbation, variant: int = 0, **options: Any) -> torch.Tensor:
     return change(config, variant, **options).amounts["a"]
 
 
 @pytest.mark.parametrize("kind", SAMPLED)
 def test_samples_are_a_function_of_seed_episode_variant_and_attempt(kind: type[Perturbation]) -> None:
-    def sample(*key: int) -> torch.Tensor:
-        return sample_change(kind(), {"a": scene()}, *key).amounts["a"]
+    def sample(seed: int, episode: int, variant: int, attempt: int = 0) -> torch.Tensor:
+        return sample_change(kind(), {"a": scene()}, seed, episode, variant, attempt).amounts["a"]
 
     first = sample(0, 1, 2)
     assert torch.equal(first, sample(0, 1, 2))
@@ -207,7 +206,9 @@ def test_every_built_in_kind_is_a_file_that_registers_itself_and_reads_its_field
     names = ["dolly", "drift", "focal", "jitter", "orbit", "other_camera", "poses", "rotation", "translation"]
     assert PERTURBATIONS.names() == names
     for name, kind in Perturbation.get_known_choices().items():
-        source = inspect.getsource(inspect.getmodule(kind))
+        module = inspect.getmodule(kind)
+        assert module is not None
+        source = inspect.getsource(module)
         for field in dataclasses.fields(kind):
             assert field.name == "per_frame" or f"self.{field.name}" in source, f"{name}.{field.name}"
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from lerobot_msdyn.core.config import Fill
 from lerobot_msdyn.views.filling import filled, filled_softly, missing
 
 
@@ -17,7 +18,7 @@ def beside_an_object() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 
 
 @pytest.mark.parametrize("fill", ["inpaint", "nearest"])
-def test_what_an_object_hid_is_continued_from_behind_it(fill: str) -> None:
+def test_what_an_object_hid_is_continued_from_behind_it(fill: Fill) -> None:
     rgb, alpha, depth = beside_an_object()
     found = filled(rgb, alpha, depth, fill)
     assert ((found[10:30, 30:36] - 0.5).abs() < 0.02).all()

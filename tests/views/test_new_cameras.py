@@ -1,6 +1,7 @@
 """New cameras keep to what was recorded: shrunk, cropped, or rejected."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ def scenes() -> dict[str, Reconstruction]:
     return {"front": reconstruct(View(seen.rgb, scene.camera, seen.depth), recipe())}
 
 
-def recipe(**changes: object) -> Recipe:
+def recipe(**changes: Any) -> Recipe:
     found = dataclasses.replace(Recipe(), **changes)
     found.fit.steps = 2
     return found

@@ -42,9 +42,10 @@ FAST = {
 def plugin() -> Iterator[list[str]]:
     """The flag that imports the plugin, which is forgotten afterwards."""
     yield ["--plugins", str(PLUGIN)]
-    PERTURBATIONS._known.pop("swing", None)
-    plugins._files.pop(str(PLUGIN), None)
-    sys.modules.pop(PLUGIN.stem, None)
+    swing = PERTURBATIONS._registered.pop("swing", None)
+    plugins._imported.pop(str(PLUGIN.resolve()), None)
+    if swing is not None:
+        sys.modules.pop(swing.__module__, None)
 
 
 def augmented(desk: Path, out: Path, flags: list[str]) -> list[np.ndarray]:
@@ -66,7 +67,8 @@ def test_one_file_is_a_kind_of_its_own(desk: Path, tmp_path: Path, plugin: list[
         assert turns.min() < -5
         assert turns.max() > 5
         assert np.abs(np.diff(turns)).max() < 7, "smooth"
-    assert not np.allclose(*swings)
+    first, second = swings
+    assert not np.allclose(first, second)
     dataset = LeRobotDataset("local/desk_msdyn", root=tmp_path / "new", video_backend="pyav")
     assert (dataset[0][FRONT] - dataset[6][FRONT]).abs().mean() > 0.01
     recipe = yaml.safe_load((tmp_path / "new" / "meta" / "msdyn" / "recipe.yaml").read_text())
@@ -126,7 +128,7 @@ def test_installed_packages_bring_kinds_by_entry_points(tmp_path: Path, monkeypa
     points = "[lerobot_msdyn.views.perturbations]\nshaking = shaking:Swing\nbroken = absent:Kind\n"
     (tmp_path / "shaking-1.0.dist-info" / "entry_points.txt").write_text(points)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(PERTURBATIONS, "_known", dict(PERTURBATIONS._known))
+    monkeypatch.setattr(PERTURBATIONS, "_registered", dict(PERTURBATIONS._registered))
     assert parse_config(AugmentConfig, ["--perturbation.azimuth_deg", "3"], {}, command="a").perturbation == Orbit(
         azimuth_deg=3.0
     )
