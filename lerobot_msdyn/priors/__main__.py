@@ -1,4 +1,4 @@
-"""Command line: compute the priors of some episodes alone, write them as exchange files, and draw them.
+"""Command line: compute the priors of some episodes alone, write them as exchange files, and show them.
 
 python -m lerobot_msdyn.priors --repo local/ds --episodes '[0]' --out DIR
 """
@@ -25,7 +25,7 @@ COMMAND = "python -m lerobot_msdyn.priors"
 
 @dataclass
 class PriorsCommandConfig(Recipe):
-    """`python -m lerobot_msdyn.priors`: compute the priors alone, and draw them."""
+    """`python -m lerobot_msdyn.priors`: compute the priors alone, and show them."""
 
     # Source dataset (alias: --repo).
     repo_id: str = ""
@@ -43,7 +43,7 @@ ALIASES = {"repo": "repo_id"}
 
 
 def run(arguments: list[str]) -> int:
-    """Compute, write and draw; returns the exit code."""
+    """Compute, write and show; returns the exit code."""
     config = parse_config(PriorsCommandConfig, arguments, ALIASES, command=COMMAND)
     for name, given in (("repo", config.repo_id != ""), ("out", config.out != Path())):
         if not given:

@@ -47,7 +47,8 @@ def estimate_priors(
         ConfigError: there is no such provider, or the device cannot be used.
         PriorError: a provider was asked for by name and cannot be had, or an exchange file cannot be used.
     """
-    request = _request(view, config, camera, elsewhere, episode, key, device, others)
+    cache, networks_on = open_cache(config.cache, view.rgb), chosen_device(device, networks=True).type
+    request = Request(view, config, camera, cache, others, elsewhere, episode, key, networks_on)
     instances, masks_from = _masks(request)
     pinhole, camera_from = provide(
         CameraProvider, camera.poses, request, lambda provider: provider.estimate(request, instances), file=CameraFile
@@ -80,25 +81,11 @@ def estimate_masks(
     device: Device = "auto",
 ) -> UInt8[Tensor, "t h w"]:
     """The masks of `estimate_priors` alone (0 = nothing moves), which finds them in the cache afterwards."""
-    return _masks(_request(view, config, camera, elsewhere, episode, key, device))[0]
+    cache, networks_on = open_cache(config.cache, view.rgb), chosen_device(device, networks=True).type
+    return _masks(Request(view, config, camera, cache, (), elsewhere, episode, key, networks_on))[0]
 
 
 def _masks(request: Request) -> tuple[Masks, Origin]:
     return provide(
         MaskProvider, request.config.masks, request, lambda provider: provider.estimate(request), file=MaskFile
     )
-
-
-def _request(
-    view: View,
-    config: PriorsConfig,
-    camera: CameraConfig,
-    elsewhere: UInt8[Tensor, "m h w 3"] | None,
-    episode: int | None,
-    key: str | None,
-    device: Device,
-    others: Sequence[View] = (),
-) -> Request:
-    network_device = chosen_device(device, networks=True).type
-    cache = open_cache(config.cache, view.rgb)
-    return Request(view, config, camera, cache, others, elsewhere, episode, key, network_device)

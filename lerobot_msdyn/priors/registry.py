@@ -70,7 +70,7 @@ class Provider(ABC):
     setting: ClassVar[str]
     registry: ClassVar[Registry[Any]]
 
-    # `auto` tries the highest first; None: it is used only where it is asked for by name. docs/priors.md lists them.
+    # `auto` tries the highest first; None: it is used only where it is asked for by name.
     rank: ClassVar[int | float | None] = None
     # Whether it must see a video as a whole: then long ones are not fitted part by part, and `auto` leaves it out.
     needs_whole_videos: ClassVar[bool] = False

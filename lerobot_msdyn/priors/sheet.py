@@ -13,7 +13,7 @@ from lerobot_msdyn.core.sampling import evenly
 _CELL_WIDTH = 320  # px
 _GAP, _LINE = 4, 22  # px: between pictures, and of a line of text
 _TAIL_S = 0.5  # length of the tracks' tails
-_MAX_TRACKS = 200  # drawn per instance: more would hide the picture
+_MAX_TRACKS = 200  # shown per instance: more would hide the image
 _DIM = 0.45  # brightness of the picture behind tracks and masks
 _WHITE, _INK, _UNKNOWN = (255, 255, 255), (30, 30, 30), (90, 90, 90)
 # Colours of the instances, told apart also with the commonest colour-blindness (Okabe and Ito), RGB.
@@ -54,15 +54,15 @@ def _block(name: str, view: View, priors: Priors, fps: int | float, columns: int
     rows: list[tuple[str, list[UInt8[ndarray, "_ _ 3"]]]] = [
         (f"{name}, {rgb.shape[2]}x{rgb.shape[1]}, {len(rgb)} frames", [rgb[t] for t in frames]),
         (
-            _said(priors, "masks", instances),
+            _head(priors, "masks", instances),
             [_instances(rgb[t], priors, t) for t in frames],
         ),
         (
-            _said(priors, "depth", f"red {near:.2f} m, blue {far:.2f} m, grey unknown"),
-            [draw_depth(priors.depth[t].numpy(), near, far) for t in frames],
+            _head(priors, "depth", f"red {near:.2f} m, blue {far:.2f} m, grey unknown"),
+            [coloured_depth(priors.depth[t].numpy(), near, far) for t in frames],
         ),
         (
-            _said(priors, "tracks", f"{len(priors.tracks)} tracks, tails of {_TAIL_S:g} s, ring = just lost"),
+            _head(priors, "tracks", f"{len(priors.tracks)} tracks, tails of {_TAIL_S:g} s, ring = just lost"),
             [_tracks(rgb[t], priors.tracks, t, tail) for t in frames],
         ),
     ]
@@ -75,8 +75,8 @@ def _block(name: str, view: View, priors: Priors, fps: int | float, columns: int
     return np.concatenate(strips)
 
 
-def _said(priors: Priors, prior: str, more: str) -> str:
-    """What the head of a row says about where it comes from."""
+def _head(priors: Priors, prior: str, more: str) -> str:
+    """The head of a row: where it comes from, and more."""
     entry = priors.provenance.get(prior, {})
     model = f" {entry['model']}" if "model" in entry else ""
     return f"{prior}: {entry.get('provider', '')}{model}; {more}"
@@ -119,11 +119,11 @@ def depth_range(priors: Priors) -> tuple[float, float]:
     return float(near), float(max(far, 1.01 * near))
 
 
-def draw_depth(depth: Float32[ndarray, "h w"], near: float, far: float) -> UInt8[ndarray, "h w 3"]:
+def coloured_depth(depth: Float32[ndarray, "h w"], near: float, far: float) -> UInt8[ndarray, "h w 3"]:
     """Inverse depth in colours, red = near, blue = far; grey where depth is unknown."""
     inverse = 1 / np.maximum(depth, 1e-6)
-    share = ((inverse - 1 / far) / (1 / near - 1 / far)).clip(0, 1)
-    coloured = cv2.applyColorMap((255 * share).round().astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1].copy()
+    nearness = ((inverse - 1 / far) / (1 / near - 1 / far)).clip(0, 1)
+    coloured = cv2.applyColorMap((255 * nearness).round().astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1].copy()
     coloured[depth <= 0] = _UNKNOWN
     return coloured
 
@@ -133,7 +133,7 @@ def _tracks(rgb: UInt8[ndarray, "h w 3"], tracks: PointTracks, frame: int, tail:
     scale = max(1, round(2 * _CELL_WIDTH / rgb.shape[1]))  # thin lines need pixels
     out = cv2.resize((_DIM * rgb).astype(np.uint8), None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR)
     xy, visible = tracks.xy.numpy() * scale, tracks.visible.numpy()
-    for row in _drawn(tracks.instance.numpy()):
+    for row in _shown(tracks.instance.numpy()):
         colour = PALETTE[(int(tracks.instance[row]) - 1) % len(PALETTE)].tolist()
         first = max(0, frame - tail)
         seen = np.nonzero(visible[row, first : frame + 1])[0] + first
@@ -146,10 +146,10 @@ def _tracks(rgb: UInt8[ndarray, "h w 3"], tracks: PointTracks, frame: int, tail:
     return out
 
 
-def _drawn(instance: Int[ndarray, " n"]) -> list[int]:
+def _shown(instance: Int[ndarray, " n"]) -> list[int]:
     """Rows of an even selection of each instance's tracks."""
     rows: list[int] = []
     for number in np.unique(instance):
-        own = np.nonzero(instance == number)[0]
-        rows += own[:: -(-len(own) // _MAX_TRACKS)].tolist()
+        of_instance = np.nonzero(instance == number)[0]
+        rows += of_instance[:: -(-len(of_instance) // _MAX_TRACKS)].tolist()
     return rows

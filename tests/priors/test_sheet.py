@@ -1,4 +1,4 @@
-"""The contact sheet: what is drawn where."""
+"""The contact sheet: what is shown where."""
 
 import numpy as np
 import torch
@@ -6,7 +6,7 @@ import torch
 from lerobot_msdyn.core.cameras import intrinsics_from_fov, static_camera
 from lerobot_msdyn.core.observations import DepthTraits, View
 from lerobot_msdyn.priors import PointTracks, Priors
-from lerobot_msdyn.priors.sheet import PALETTE, contact_sheet, depth_range, draw_depth
+from lerobot_msdyn.priors.sheet import PALETTE, coloured_depth, contact_sheet, depth_range
 
 
 def priors_of(view: View, depth: torch.Tensor) -> Priors:
@@ -36,7 +36,7 @@ def test_a_clip_shorter_than_the_columns_shows_each_frame_once(sliding) -> None:
 
 def test_near_is_red_far_is_blue_unknown_is_grey() -> None:
     depth = np.array([[0.5, 2.0, 0.0]], np.float32)
-    near, far, unknown = draw_depth(depth, 0.5, 2.0)[0].astype(int)
+    near, far, unknown = coloured_depth(depth, 0.5, 2.0)[0].astype(int)
     assert near[0] > near[2]
     assert far[2] > far[0]
     assert unknown.tolist() == [90, 90, 90]

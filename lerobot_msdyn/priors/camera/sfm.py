@@ -119,14 +119,14 @@ def interpolated_poses(poses: dict[int, Float[ndarray, "4 4"]], frames: int) -> 
 
     The first frame's camera becomes the world.
     """
-    known = sorted(poses)
-    matrices = torch.from_numpy(np.stack([poses[frame] for frame in known])).double()
+    registered = sorted(poses)
+    matrices = torch.from_numpy(np.stack([poses[frame] for frame in registered])).double()
     quats = matrix_to_quaternion(matrices[:, :3, :3])
     for i in range(1, len(quats)):
         if float((quats[i] * quats[i - 1]).sum()) < 0:
             quats[i] = -quats[i]
     values = torch.cat((quats, matrices[:, :3, 3]), dim=1).numpy()
-    every = np.stack([np.interp(np.arange(frames), known, values[:, i]) for i in range(7)], axis=1)
+    every = np.stack([np.interp(np.arange(frames), registered, values[:, i]) for i in range(7)], axis=1)
     out = torch.eye(4, dtype=torch.float64).repeat(frames, 1, 1)
     turns = torch.from_numpy(every[:, :4] / np.linalg.norm(every[:, :4], axis=1, keepdims=True))
     out[:, :3, :3] = quaternion_to_matrix(turns)

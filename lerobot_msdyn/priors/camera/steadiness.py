@@ -39,9 +39,11 @@ def _usable(moving: Bool[Tensor, "t h w"] | None, frame: int, shape: tuple[int, 
 def _motion_px(a: UInt8[ndarray, "h w"], b: UInt8[ndarray, "h w"], usable: UInt8[ndarray, "h w"]) -> float:
     corners = cv2.goodFeaturesToTrack(a, _CORNERS, 0.01, 7, mask=usable)
     if corners is not None and len(corners) >= _MIN_CORNERS:
-        there, found, _ = cv2.calcOpticalFlowPyrLK(a, b, corners, None, winSize=(21, 21), maxLevel=4)
+        there, followed, _ = cv2.calcOpticalFlowPyrLK(a, b, corners, None, winSize=(21, 21), maxLevel=4)
         back, returned, _ = cv2.calcOpticalFlowPyrLK(b, a, there, None, winSize=(21, 21), maxLevel=4)
-        good = (found[:, 0] > 0) & (returned[:, 0] > 0) & (np.linalg.norm(back - corners, axis=-1)[:, 0] < _RETURN_PX)
+        good = (
+            (followed[:, 0] > 0) & (returned[:, 0] > 0) & (np.linalg.norm(back - corners, axis=-1)[:, 0] < _RETURN_PX)
+        )
         if good.sum() >= _MIN_CORNERS:
             return float(np.median(np.linalg.norm((there - corners)[good, 0], axis=-1)))
     pair: list[Float32[ndarray, "h w"]] = [np.where(usable > 0, image, 0).astype(np.float32) for image in (a, b)]

@@ -61,7 +61,7 @@ def align_scale(
 def _samples(
     reference: Float[Tensor, "t h w"], values: Float[Tensor, "t h w"], usable: Bool[Tensor, "t h w"] | None
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-    """Pairs of reference depth (m) and value, evenly drawn from where both are known."""
+    """Pairs of reference depth (m) and value, evenly taken from where both are known."""
     both = (reference > 0) & torch.isfinite(values)
     if usable is not None:
         both &= usable

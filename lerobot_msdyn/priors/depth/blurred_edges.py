@@ -26,12 +26,12 @@ def _sharpened(z: np.ndarray) -> np.ndarray:
     inverse = np.where(known, 1 / np.maximum(z, np.float32(1e-6)), np.float32(0))
     near, far, jump = _span(inverse, known, REACH_PX)
     wide_jump = _span(inverse, known, 2 * REACH_PX)[2]
-    share = (inverse - far) / np.maximum(jump, 1e-9)
-    edge = known & (jump > JUMP * far) & (wide_jump < NARROW * jump) & (share > BETWEEN) & (share < 1 - BETWEEN)
+    nearness = (inverse - far) / np.maximum(jump, 1e-9)
+    edge = known & (jump > JUMP * far) & (wide_jump < NARROW * jump) & (nearness > BETWEEN) & (nearness < 1 - BETWEEN)
     inside = np.zeros_like(known)  # at the border of the image a slope cannot be told from an edge
     inside[2 * REACH_PX : -2 * REACH_PX, 2 * REACH_PX : -2 * REACH_PX] = True
     edge &= inside
-    return np.where(edge, 1 / np.where(share > 0.5, near, far).clip(1e-6), z).astype(np.float32)
+    return np.where(edge, 1 / np.where(nearness > 0.5, near, far).clip(1e-6), z).astype(np.float32)
 
 
 def _span(inverse: np.ndarray, known: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -49,10 +49,10 @@ def why_no_partner(view: View, others: Sequence[View]) -> str:
         return "no other camera of the episode is read with this one"
     if not _is_calibrated(view.camera):
         return "this camera is not calibrated"
-    known = [other.camera for other in others if _is_calibrated(other.camera)]
-    if not known:
+    calibrated = [other.camera for other in others if _is_calibrated(other.camera)]
+    if not calibrated:
         return "no other camera is calibrated"
-    apart = [camera for camera in known if _baseline(view.camera, camera) > _MIN_BASELINE_M]
+    apart = [camera for camera in calibrated if _baseline(view.camera, camera) > _MIN_BASELINE_M]
     if not apart:
         return "the other calibrated cameras stand at the same place"
     nearest = min(_angle_deg(view.camera, camera) for camera in apart)
@@ -100,17 +100,18 @@ def _is_stereo_pair(camera: CameraTrack, other: CameraTrack) -> bool:
 
 
 def _points_at(view: View, partners: Sequence[View], frame: int) -> Points:
-    own = find_features(view.rgb[frame].numpy())
-    found = [
-        matched_points(own, find_features(other.rgb[frame].numpy()), view.camera, other.camera) for other in partners
+    features = find_features(view.rgb[frame].numpy())
+    matched = [
+        matched_points(features, find_features(other.rgb[frame].numpy()), view.camera, other.camera)
+        for other in partners
     ]
-    return np.concatenate(found)
+    return np.concatenate(matched)
 
 
 def _filled(points: list[Points], instances: UInt8[ndarray, "t h w"]) -> Float32[ndarray, "t h w"]:
     """Points of every frame, spread over the background and over each instance."""
-    labels = [instance_of(found, instances[frame]) for frame, found in enumerate(points)]
-    still = confirmed([found[label == 0] for found, label in zip(points, labels, strict=True)])
+    labels = [instance_of(cloud, instances[frame]) for frame, cloud in enumerate(points)]
+    still = confirmed([cloud[label == 0] for cloud, label in zip(points, labels, strict=True)])
     if len(still) < _MIN_POINTS:
         raise PriorError(
             f"stereo: only {len(still)} features of the background were found in other cameras over {len(points)} "
@@ -119,14 +120,14 @@ def _filled(points: list[Points], instances: UInt8[ndarray, "t h w"]) -> Float32
     background = spread(still, np.ones(instances.shape[1:], bool))
     depth = np.repeat(background[None], len(points), axis=0)
     for number in range(1, int(instances.max()) + 1):
-        own = [without_outliers(found[label == number]) for found, label in zip(points, labels, strict=True)]
-        seen = [frame for frame, found in enumerate(own) if len(found)]
+        clouds = [without_outliers(cloud[label == number]) for cloud, label in zip(points, labels, strict=True)]
+        seen = [frame for frame, cloud in enumerate(clouds) if len(cloud)]
         if not seen:
             continue  # it keeps the depth of the background
-        middle = np.interp(np.arange(len(points)), seen, [np.median(own[frame][:, 2]) for frame in seen])
-        for frame, found in enumerate(own):
+        middle = np.interp(np.arange(len(points)), seen, [np.median(clouds[frame][:, 2]) for frame in seen])
+        for frame, cloud in enumerate(clouds):
             mask = instances[frame] == number
-            dense = spread(found, mask) if len(found) >= _MIN_POINTS else np.float32(middle[frame]) * mask
+            dense = spread(cloud, mask) if len(cloud) >= _MIN_POINTS else np.float32(middle[frame]) * mask
             depth[frame][mask] = dense[mask]
     return depth
 

@@ -48,8 +48,8 @@ def without_holes(mask: Bool[Tensor, "t h w"]) -> Bool[Tensor, "t h w"]:
 
 def _standing(mask: Bool[Tensor, "t h w"], rows: Float[Tensor, " h"]) -> Float[Tensor, " t"]:
     """Depth (m) of an instance at every frame, from the row where it touches the table."""
-    share = mask.sum(2).cumsum(1) / mask.sum((1, 2)).clamp(min=1)[:, None]
-    foot = (share < _LOWEST).sum(1).clamp(max=len(rows) - 1)
+    down_to_row = mask.sum(2).cumsum(1) / mask.sum((1, 2)).clamp(min=1)[:, None]
+    foot = (down_to_row < _LOWEST).sum(1).clamp(max=len(rows) - 1)
     seen = mask.any(2).any(1).nonzero()[:, 0].numpy()
     nearest = np.interp(np.arange(len(mask)), seen, rows[foot[seen]].numpy()).astype(np.float32)
     reach = _SMOOTH_FRAMES // 2

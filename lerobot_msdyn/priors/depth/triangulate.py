@@ -43,12 +43,12 @@ def find_features(image: UInt8[ndarray, "h w 3"]) -> Features:
     return Features(np.array([point.pt for point in points]) + 0.5, descriptors)
 
 
-def matched_points(found: Features, others: Features, camera: CameraTrack, other: CameraTrack) -> Points:
+def matched_points(features: Features, others: Features, camera: CameraTrack, other: CameraTrack) -> Points:
     """x, y (px) and z-depth (m) in `camera` of features that both pictures show and that fit the calibration."""
-    if min(len(found.xy), len(others.xy)) < 2:
+    if min(len(features.xy), len(others.xy)) < 2:
         return np.zeros((0, 3), np.float32)
-    pairs = np.array(_mutual(found.descriptors, others.descriptors), int).reshape(-1, 2)
-    return _triangulated(found.xy[pairs[:, 0]], others.xy[pairs[:, 1]], camera, other)
+    pairs = np.array(_mutual(features.descriptors, others.descriptors), int).reshape(-1, 2)
+    return _triangulated(features.xy[pairs[:, 0]], others.xy[pairs[:, 1]], camera, other)
 
 
 def confirmed(points: list[Points]) -> Points:
@@ -56,7 +56,7 @@ def confirmed(points: list[Points]) -> Points:
 
     Chance matches happen once; what is there is found again at the same place.
     """
-    frame = np.repeat(np.arange(len(points)), [len(found) for found in points])
+    frame = np.repeat(np.arange(len(points)), [len(cloud) for cloud in points])
     gathered = np.concatenate(points)
     cells = np.floor(gathered[:, :2] / _CELL).astype(int)
     kept = np.zeros(len(gathered), bool)
@@ -140,9 +140,9 @@ def spread(points: Float32[ndarray, "n 3"], inside: Bool[ndarray, "h w"]) -> Flo
     sigma = 1.0
     while sigma < max(value.shape):  # the narrowest Gaussian with points in it decides
         near = cv2.GaussianBlur(weight, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
-        share = np.float32(sigma**-4)
-        total += share * cv2.GaussianBlur(value * weight, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
-        reach += share * near
+        emphasis = np.float32(sigma**-4)
+        total += emphasis * cv2.GaussianBlur(value * weight, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
+        reach += emphasis * near
         sigma *= 2
     dense = np.where(reach > 0, total / np.maximum(reach, 1e-30), np.median(1 / points[:, 2]))
     inverse = cv2.resize(dense.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)

@@ -105,10 +105,10 @@ def along_edges(odds: Float32[ndarray, "h w"], frame: UInt8[ndarray, "h w 3"]) -
     guide = frame.astype(np.float32)
     guide_mean, odds_mean = _mean(guide, _GUIDE_WINDOW), _mean(odds, _GUIDE_WINDOW)
     pr, pg, pb = cv2.split(_mean(guide * odds[..., None], _GUIDE_WINDOW) - guide_mean * odds_mean[..., None])
-    own = _mean(guide * guide, _GUIDE_WINDOW) - guide_mean * guide_mean + np.float32(_GUIDE_NOISE)
+    squares = _mean(guide * guide, _GUIDE_WINDOW) - guide_mean * guide_mean + np.float32(_GUIDE_NOISE)
     turned, turned_mean = guide[..., [1, 2, 0]], guide_mean[..., [1, 2, 0]]
     between = _mean(guide * turned, _GUIDE_WINDOW) - guide_mean * turned_mean
-    (rr, gg, bb), (rg, gb, rb) = cv2.split(own), cv2.split(between)
+    (rr, gg, bb), (rg, gb, rb) = cv2.split(squares), cv2.split(between)
     # the inverse of the symmetric 3x3 covariance, by cofactors
     c_rr, c_rg, c_rb = gg * bb - gb * gb, rb * gb - rg * bb, rg * gb - rb * gg
     c_gg, c_gb, c_bb = rr * bb - rb * rb, rb * rg - rr * gb, rr * gg - rg * rg
@@ -150,8 +150,8 @@ class Colours:
 
 def _bins(frame: UInt8[ndarray, "h w 3"]) -> Int[ndarray, "h w"]:
     lightness, a, b = cv2.split(cv2.cvtColor(frame, cv2.COLOR_RGB2LAB))  # 8 bit: lightness * 2.55, colour + 128
-    share = np.arange(256) / 255, (np.arange(256) - 48) / 160, (np.arange(256) - 48) / 160
-    bins = [(s * n).astype(int).clip(0, n - 1) for s, n in zip(share, _COLOUR_BINS, strict=True)]
+    positions = np.arange(256) / 255, (np.arange(256) - 48) / 160, (np.arange(256) - 48) / 160
+    bins = [(s * n).astype(int).clip(0, n - 1) for s, n in zip(positions, _COLOUR_BINS, strict=True)]
     _, columns, depth = _COLOUR_BINS
     return (bins[0] * columns * depth)[lightness] + (bins[1] * depth)[a] + bins[2][b]
 

@@ -28,14 +28,14 @@ def _linked(frames: UInt8[ndarray, "t h w 3"], moving: Bool[ndarray, "t h w"]) -
         carried = np.zeros_like(labels[0])
         if t > 0 and labels[t - 1].any():
             flow = dis.calc(grey[t], grey[t - 1], None)
-            before = labels[t - 1].astype(np.float32)
-            carried = cv2.remap(before, x + flow[..., 0], y + flow[..., 1], cv2.INTER_NEAREST).astype(np.int32)
+            last = labels[t - 1].astype(np.float32)
+            carried = cv2.remap(last, x + flow[..., 0], y + flow[..., 1], cv2.INTER_NEAREST).astype(np.int32)
         count, components = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
         for component in range(1, count):
             inside = components == component
-            known = carried * inside
-            if known.any():
-                labels[t][inside] = known.ravel()[nearest_of(known > 0)[inside]]
+            before = carried * inside
+            if before.any():
+                labels[t][inside] = before.ravel()[nearest_of(before > 0)[inside]]
             else:
                 used += 1
                 labels[t][inside] = used

@@ -112,9 +112,9 @@ def _enlarged(numbers: UInt8[ndarray, "h w"], size: tuple[int, int]) -> UInt8[nd
     """Numbered regions at a larger size (width, height), with smooth outlines."""
     out, most = np.zeros(size[::-1], np.uint8), np.full(size[::-1], 0.5, np.float32)
     for number in np.unique(numbers[numbers > 0]):
-        share = cv2.resize((numbers == number).astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
-        out[share > most] = number
-        most = np.maximum(most, share)
+        coverage = cv2.resize((numbers == number).astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
+        out[coverage > most] = number
+        most = np.maximum(most, coverage)
     return out
 
 

@@ -1,7 +1,7 @@
 """Masks by SAM 2 (Ravi et al., 2024) or EdgeTAM (Zhou et al., CVPR 2025), through transformers.
 
 Nobody clicks: each instance that the weights-free masks found is shown to the network once, in the frame in which its
-mask is most trustworthy, and followed from there to both ends of the clip. The network draws better outlines and
+mask is most trustworthy, and followed from there to both ends of the clip. The network outlines things better and
 follows what rests; what the weights-free masks did not find at all stays unfound.
 """
 

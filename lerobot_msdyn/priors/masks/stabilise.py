@@ -23,11 +23,11 @@ def camera_sway(
     corners = cv2.goodFeaturesToTrack(grey, _CORNERS, 0.01, 5)
     if corners is None or len(corners) < _MIN_CORNERS:
         return None
-    found = np.stack([_motion(grey, cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), corners) for frame in frames])
+    motions = np.stack([_motion(grey, cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), corners) for frame in frames])
     height, width = grey.shape
     ends = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], np.float32)
-    moved = np.linalg.norm(ends @ found.transpose(0, 2, 1) - ends[:, :2], axis=-1)
-    return found if np.median(moved) > _NEGLIGIBLE_PX else None
+    moved = np.linalg.norm(ends @ motions.transpose(0, 2, 1) - ends[:, :2], axis=-1)
+    return motions if np.median(moved) > _NEGLIGIBLE_PX else None
 
 
 def _motion(

@@ -46,11 +46,11 @@ def _homography(target: UInt8[ndarray, "h w"], source: UInt8[ndarray, "h w"]) ->
     corners = cv2.goodFeaturesToTrack(target, _CORNERS, 0.01, 7)
     if corners is None or len(corners) < _MIN_CORNERS:
         return None
-    found, status, _ = cv2.calcOpticalFlowPyrLK(target, source, corners, None, winSize=(21, 21), maxLevel=4)
+    followed, status, _ = cv2.calcOpticalFlowPyrLK(target, source, corners, None, winSize=(21, 21), maxLevel=4)
     good = status[:, 0] > 0
     if good.sum() < _MIN_CORNERS:
         return None
-    homography, agree = cv2.findHomography(corners[good], found[good], cv2.RANSAC, _AGREE_PX)
+    homography, agree = cv2.findHomography(corners[good], followed[good], cv2.RANSAC, _AGREE_PX)
     return homography if homography is not None and agree.sum() >= _MIN_CORNERS else None
 
 

@@ -46,14 +46,13 @@ class Patches:
         values = _values(grey, xy)
         return values - (_dot(self.weights, values) / self.weights.sum(1))[:, None]
 
-    def _compare(self, found: Float32[ndarray, "n p"]) -> tuple[Float32[ndarray, " n"], Float32[ndarray, " n"]]:
+    def _compare(self, values: Float32[ndarray, "n p"]) -> tuple[Float32[ndarray, " n"], Float32[ndarray, " n"]]:
         """Correlation with other patches less their means, and the other's contrast relative to this one's."""
         total = self.weights.sum(1)
-        weighted = self.weights * found
+        weighted = self.weights * values
         covariance = _dot(weighted, self.values) / total + _NOISE_VARIANCE
-        energy = _dot(weighted, found) / total + _NOISE_VARIANCE
-        own = self.energy + _NOISE_VARIANCE
-        return covariance / np.sqrt(energy * own), np.sqrt(energy / own)
+        energy, reference = _dot(weighted, values) / total + _NOISE_VARIANCE, self.energy + _NOISE_VARIANCE
+        return covariance / np.sqrt(energy * reference), np.sqrt(energy / reference)
 
 
 def cut(grey: Float32[ndarray, "h w"], labels: UInt8[ndarray, "h w"], xy: Float32[ndarray, "n 2"]) -> Patches:
@@ -86,9 +85,9 @@ def register(
     inverse = np.linalg.inv(hessian)
     xy = start.copy()
     for _ in range(_ITERATIONS):
-        found = patches._look(grey, xy)
-        gain = patches._compare(found)[1].clip(*_GAIN)[:, None]
-        error = (across @ (found / gain - patches.values)[..., None])[..., 0] + prior * (xy - start)
+        values = patches._look(grey, xy)
+        gain = patches._compare(values)[1].clip(*_GAIN)[:, None]
+        error = (across @ (values / gain - patches.values)[..., None])[..., 0] + prior * (xy - start)
         xy = xy - (inverse @ error[..., None])[..., 0]
     moved = np.linalg.norm(xy - start, axis=1)
     xy = np.where((moved < _MAX_MOVE_PX)[:, None], xy, start)
