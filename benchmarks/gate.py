@@ -3,14 +3,14 @@
     python benchmarks/gate.py --sim FOLDER [--scenes A,B] [--json FILE]
 
 FOLDER holds one folder per scene with dataset_depth/ and gt/ (docs/evaluate.md). Every scene is reconstructed from
-good priors and in five bad ways (corruptions.py); every reconstruction is drawn from all held-out cameras.
+good priors and in five bad ways (corruptions.py); every reconstruction is rendered from all held-out cameras.
 One case is one scene, corruption and camera. Printed, and written to FILE:
 
     cases                 how many
     spearman              rank correlation of the gate's episode score and the true PSNR over what was seen
     caught_share          share of the views under 20 dB that are among the fifth with the worst scores
     coverage_error_points mean difference of the predicted and the true covered share, in points of percent
-    flicker_ratio         flicker of what stands still, drawn against recorded, mean of the uncorrupted reconstructions
+    flicker_ratio         flicker of what stands still, rendered against recorded, mean over uncorrupted reconstructions
 
 To be affordable, every third frame is used, 160 px wide, with 40 steps and rigid parts (--stride, --width, --steps).
 """
@@ -72,10 +72,10 @@ def main(arguments: list[str]) -> None:
     rows: list[Row] = []
     for scene in scenes:
         rows += measure(a.sim / scene, a.corruptions.split(","), a.stride, a.width, a.steps)
-    found = summary(rows)
-    print(json.dumps(found))
+    figures = summary(rows)
+    print(json.dumps(figures))
     if a.json:
-        a.json.write_text(json.dumps(found | {"rows": [asdict(row) for row in rows]}, indent=1))
+        a.json.write_text(json.dumps(figures | {"rows": [asdict(row) for row in rows]}, indent=1))
 
 
 def measure(folder: Path, corruptions: list[str], stride: int, width: int, steps: int) -> list[Row]:
@@ -114,9 +114,9 @@ def views(scene: Reconstruction, folder: Path, path: Path, corruption: str, stri
     with av.open(str(path.with_suffix(".mkv"))) as video:
         true = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
     errors, covered = [], []
-    drawn = new_pictures(scene, full.resized(width, height), torch.from_numpy(frames).long())
-    for index, share, picture in zip(chosen, seen, drawn, strict=True):
-        inside = cv2.resize(share, (width, height), interpolation=cv2.INTER_AREA) > 0.99
+    rendered = new_pictures(scene, full.resized(width, height), torch.from_numpy(frames).long())
+    for index, covered_part, picture in zip(chosen, seen, rendered, strict=True):
+        inside = cv2.resize(covered_part, (width, height), interpolation=cv2.INTER_AREA) > 0.99
         goal = cv2.resize(true[index], (width, height), interpolation=cv2.INTER_AREA)
         difference = (picture.rgb.astype(np.float32) - goal) / 255
         errors.append(decibels(float(np.square(difference[inside]).mean())))

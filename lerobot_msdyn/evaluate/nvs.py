@@ -143,17 +143,17 @@ def _true_pictures(path: Path, frames: list[int]) -> UInt8[ndarray, "n h w 3"] |
     if video.is_file():
         try:
             with av.open(str(video)) as container:
-                found = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+                pictures = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
         except (av.FFmpegError, OSError) as error:
             raise DatasetError(f"{video}: cannot be decoded ({error})") from error
     elif folder.is_dir():
         files = [folder / f"rgb_{frame:04d}.png" for frame in frames]
-        found = [picture for file in files if (picture := cv2.imread(str(file), cv2.IMREAD_COLOR_RGB)) is not None]
+        pictures = [picture for file in files if (picture := cv2.imread(str(file), cv2.IMREAD_COLOR_RGB)) is not None]
     else:
         return None
-    if len(found) != len(frames):
-        raise DatasetError(f"{path}: has {len(frames)} frames, the true pictures beside it are {len(found)}")
-    return np.stack(found)
+    if len(pictures) != len(frames):
+        raise DatasetError(f"{path}: has {len(frames)} frames, the true pictures beside it are {len(pictures)}")
+    return np.stack(pictures)
 
 
 def _moving_bodies(meta: Path) -> list[int]:

@@ -84,7 +84,7 @@ class Evaluated:
         )
 
 
-def score_views(drawn: UInt8[ndarray, "n h w 3"], true: TrueViews) -> Scores:
+def score_views(rendered: UInt8[ndarray, "n h w 3"], true: TrueViews) -> Scores:
     """Means over the frames of one camera that stands still; of a kind of pixels that no frame has enough of: none.
 
     psnr, ssim, flip: over what the recorded camera saw at any time; dyn_*: the moving part of it; dis_psnr: what it
@@ -92,19 +92,19 @@ def score_views(drawn: UInt8[ndarray, "n h w 3"], true: TrueViews) -> Scores:
     """
     frames: list[Scores] = []
     perceptual = without_flip() == ""
-    for i, (picture, truth) in enumerate(zip(drawn, true.rgb, strict=True)):
+    for i, (picture, truth) in enumerate(zip(rendered, true.rgb, strict=True)):
         covered = true.seen[i] != NEVER
         kinds = {"": covered, "dis_": true.seen[i] == ELSEWHEN}
         if true.moving is not None:
             kinds["dyn_"] = covered & true.moving[i]
         enough = {kind: mask for kind, mask in kinds.items() if mask.sum() >= MIN_PIXELS}
-        found = {f"{kind}psnr": masked_psnr_db(picture, truth, mask) for kind, mask in enough.items()}
-        found |= {f"{kind}ssim": inside_ssim(picture, truth, mask) for kind, mask in enough.items() if kind != "dis_"}
+        scores = {f"{kind}psnr": masked_psnr_db(picture, truth, mask) for kind, mask in enough.items()}
+        scores |= {f"{kind}ssim": inside_ssim(picture, truth, mask) for kind, mask in enough.items() if kind != "dis_"}
         if perceptual and "" in enough:
-            found["flip"] = masked_flip(picture, truth, covered)
-        frames.append(found)
+            scores["flip"] = masked_flip(picture, truth, covered)
+        frames.append(scores)
     still = true.seen != NEVER if true.moving is None else (true.seen != NEVER) & ~true.moving
-    return mean_scores(frames) | {"flicker": flicker(drawn, true.rgb, still)}
+    return mean_scores(frames) | {"flicker": flicker(rendered, true.rgb, still)}
 
 
 def dynamic_psnr_db(rendered: UInt8[ndarray, "n h w 3"], true: TrueViews) -> float:
@@ -131,8 +131,8 @@ def source_shares(scene: Reconstruction, camera: CameraTrack, frames: Int[Tensor
 
 def mean_scores(scores: list[Scores]) -> Scores:
     """The mean of each score over those that have it, in the order of the columns."""
-    found = {name: [one[name] for one in scores if not math.isnan(one.get(name, math.nan))] for name in NAMES}
-    return {name: float(np.mean(values)) for name, values in found.items() if values}
+    values = {name: [one[name] for one in scores if not math.isnan(one.get(name, math.nan))] for name in NAMES}
+    return {name: float(np.mean(each)) for name, each in values.items() if each}
 
 
 def score_table(cameras: Mapping[str, Scores], first: str = "camera") -> str:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.core.sampling import scaled_px
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.core.visibility import projected
 from lerobot_msdyn.priors import Priors
@@ -26,19 +27,19 @@ COLOUR_ERROR = 0.06  # mean absolute difference of colours 0..1, over about a pi
 DEPTH_ERROR = 0.02  # relative difference of depths beyond which it is not, at least
 JUMP = 0.05  # relative step of depth to the surface in front, beyond which a pixel belongs to the one behind
 THICKNESS = 0.03  # share of the depth within which a Gaussian belongs to the recorded surface
-SCALE = 0.7  # of a pixel's Gaussian: its neighbours are drawn as well
+SCALE = 0.7  # of a pixel's Gaussian: its neighbours are rendered as well
 ERROR_AROUND = 0.04  # the same over several pixels of the moving set, all of which it then condemns
-_SMOOTH_PX, _AROUND_PX = 1.0, 8.0
+_SMOOTH_PX, _AROUND_PX = 1.0, 8.0  # standard deviations of these averages, at a width of 320
 _BESIDE = np.ones((3, 3), np.uint8)  # a pixel and those beside it
 
 
 def unexplained(scene: DynamicScene, view: View, priors: Priors, backend: str = "auto") -> Overlay:
     """The patches of all frames that make the recorded camera see what it recorded (docs/reconstruction.md, "Overlay").
 
-    A pixel is unexplained where the drawn picture has another colour or depth than the recorded one. There the frame's
-    own pixels are put at their recorded depth, for this frame alone, and Gaussians of the scene in front of that
-    surface or on it are not drawn. What lies behind it stays, and is seen past its edges from other cameras. Depth only
-    contradicts the scene beyond what its provider may err by, and not at all where it is assumed.
+    A pixel is unexplained where the rendered picture has another colour or depth than the recorded one. There the
+    frame's own pixels are put at their recorded depth, for this frame alone, and Gaussians of the scene in front of
+    that surface or on it are not rendered. What lies behind it stays, and is seen past its edges from other cameras.
+    Depth only contradicts the scene beyond what its provider may err by, and not at all where it is assumed.
 
     Args:
         scene: fitted, without an overlay; on any device, the result is on the host.
@@ -52,13 +53,13 @@ def unexplained(scene: DynamicScene, view: View, priors: Priors, backend: str = 
         depth = fill_depth(priors.depth[frame])
         if still is None or not view.camera.is_static:
             still = render_scene(scene.still(), camera, when, backend).depth[0].cpu()
-        drawn = to_device(render_scene(scene, camera, when, backend), "cpu")
-        wrong = _wrong(drawn, view.rgb[frame].float() / 255, depth.numpy(), tolerance)
+        rendering = to_device(render_scene(scene, camera, when, backend), "cpu")
+        wrong = _wrong(rendering, view.rgb[frame].float() / 255, depth.numpy(), tolerance)
         taken = wrong & ~_behind_an_edge(depth.numpy(), still.numpy())
         patches.append(_patch(scene, view, depth, frame, wrong, taken, backend))
     overlay = packed(patches)
-    share = len(overlay.means) / max(priors.depth.numel(), 1)
-    logger.info("overlay: %.1f %% of the recorded pixels are not explained and shown as recorded", 100 * share)
+    percent = 100 * len(overlay.means) / max(priors.depth.numel(), 1)
+    logger.info("overlay: %.1f %% of all pixels are not explained and shown as recorded", percent)
     return overlay
 
 
@@ -69,18 +70,19 @@ def depth_tolerance(priors: Priors) -> float:
 
 
 def _wrong(
-    drawn: Rendering, recorded: Float[Tensor, "h w 3"], depth: Float[ndarray, "h w"], tolerance: float
+    rendering: Rendering, recorded: Float[Tensor, "h w 3"], depth: Float[ndarray, "h w"], tolerance: float
 ) -> Bool[ndarray, "h w"]:
-    """Where a drawn picture has another colour or depth (m) than the recorded one, and the pixels beside."""
-    difference = (drawn.rgb[0].clamp(0, 1) - recorded).abs().mean(-1).numpy()
-    found = drawn.depth[0].numpy()
-    moving = (drawn.moving[0] > 0.5).numpy()
-    around = _blurred(difference * moving, _AROUND_PX) > ERROR_AROUND * _blurred(moving, _AROUND_PX)
-    wrong = (_blurred(difference, _SMOOTH_PX) > COLOUR_ERROR) | (np.abs(found / depth - 1) > tolerance)
+    """Where a rendered picture has another colour or depth (m) than the recorded one, and the pixels beside."""
+    difference = (rendering.rgb[0].clamp(0, 1) - recorded).abs().mean(-1).numpy()
+    rendered = rendering.depth[0].numpy()
+    moving = (rendering.moving[0] > 0.5).numpy()
+    smooth_px, around_px = (scaled_px(px, depth.shape[1]) for px in (_SMOOTH_PX, _AROUND_PX))
+    around = _blurred(difference * moving, around_px) > ERROR_AROUND * _blurred(moving, around_px)
+    wrong = (_blurred(difference, smooth_px) > COLOUR_ERROR) | (np.abs(rendered / depth - 1) > tolerance)
     wrong |= moving & around
     # Behind an edge colours are mixed, and say nothing; there only the depth of no pixel beside counts as wrong.
-    apart = (depth < (1 - tolerance) * cv2.erode(found, _BESIDE)) | (
-        depth > (1 + tolerance) * cv2.dilate(found, _BESIDE)
+    apart = (depth < (1 - tolerance) * cv2.erode(rendered, _BESIDE)) | (
+        depth > (1 + tolerance) * cv2.dilate(rendered, _BESIDE)
     )
     wrong = np.where(_behind(depth), apart, wrong)
     opened = cv2.morphologyEx(wrong.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
@@ -112,7 +114,7 @@ def _patch(
     taken: Bool[ndarray, "h w"],
     backend: str,
 ) -> FramePatch:
-    """The pixels that are taken as Gaussians, with colours that make the drawn picture the recorded one."""
+    """The pixels that are taken as Gaussians, with colours that make the rendered picture the recorded one."""
     camera, when = view.camera.select([frame]), torch.tensor([frame])
     chosen = torch.from_numpy(taken).reshape(-1)
     pixels = pixel_gaussians(view.rgb[frame], depth, view.camera, frame)[0].select(chosen)
@@ -121,8 +123,8 @@ def _patch(
     first = FramePatch(pixels.means, pixels.quats, log_scales, recorded, hidden)
     if len(first) == 0:
         return first
-    drawn = render_patched(scene, camera, frame, first, backend).rgb[0].cpu().reshape(-1, 3)[chosen]
-    return FramePatch(pixels.means, pixels.quats, log_scales, (2 * recorded - drawn).clamp(0, 1.5), hidden)
+    rendered = render_patched(scene, camera, frame, first, backend).rgb[0].cpu().reshape(-1, 3)[chosen]
+    return FramePatch(pixels.means, pixels.quats, log_scales, (2 * recorded - rendered).clamp(0, 1.5), hidden)
 
 
 def _hidden(

@@ -1,8 +1,8 @@
 """How well a fitted scene explains its own video, at a few frames that the fit never saw: all there is to judge it by.
 
 No ground truth is used. Brightness over time, masks and tracks were measured on these frames as well; the Gaussians
-were not fitted to them. New views are drawn with the overlay, which every frame has of itself: so what is wrong with
-them is judged with it, and what the scene alone makes of frames that it never saw is said beside.
+were not fitted to them. New views are rendered with the overlay, which every frame has of itself: so what is wrong with
+them is judged with it, and what the scene alone makes of frames that it never saw is told beside.
 """
 
 import logging
@@ -18,7 +18,7 @@ from torch import Tensor
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.geometry import project, transform_points
 from lerobot_msdyn.core.observations import View
-from lerobot_msdyn.core.sampling import evenly
+from lerobot_msdyn.core.sampling import evenly, scaled_px
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.reconstruction.account import Account, account_line
@@ -29,10 +29,10 @@ from lerobot_msdyn.scene.sources import Sources, sources_of
 logger = logging.getLogger(__name__)
 
 CHECKED_FRAMES = 3  # frames that are looked at where none was held out
-STILL_PX = 5  # side of the square around a pixel in which nothing may move for it to stand still
+STILL_PX = 2  # at a width of 320; so far around a pixel nothing may move for it to stand still
 TRACKED = 400  # points, at most, of which the residual is measured
-SSIM_WINDOW = 11
-TRACK_FRAMES = 12  # in which they are looked for
+SSIM_WINDOW = 11  # px of any picture, as in the definition: figures of other sizes are not comparable
+TRACK_FRAMES = 12  # at which it is measured
 DEPTH_FRAMES = 12  # at which the depth of what stands still is compared with itself
 
 
@@ -45,7 +45,7 @@ class SelfCheck:
     camera: CameraTrack
     recorded: Float[Tensor, "t h w 3"]  # 0..1
     depth: Float[Tensor, "t h w"]  # m, prior; 0 = unknown
-    drawn_depth: Float[Tensor, "t h w"]  # m, of the scene with its overlay
+    rendered_depth: Float[Tensor, "t h w"]  # m, of the scene with its overlay
     error: Float[Tensor, " t"]  # mean square colour error of the scene with its overlay, 0..1
     fitted_error: Float[Tensor, " t"]  # the same without the overlay
     moving: Bool[Tensor, "t h w"]  # where the masks say that something moves
@@ -72,14 +72,16 @@ def self_check(scene: DynamicScene, view: View, priors: Priors, held_out: Int[Te
     if len(held_out) == 0 and total > CHECKED_FRAMES + 1:
         frames = frames[1:-1]
     camera = view.camera.select(frames)
-    drawn = to_device(render_scene(scene, camera, frames), "cpu")
+    rendering = to_device(render_scene(scene, camera, frames), "cpu")
     recorded = view.rgb[frames].float() / 255
-    pictures = render_scene(replace(scene, overlay=None), camera, frames).rgb.clamp(0, 1).cpu()
+    alone = render_scene(replace(scene, overlay=None), camera, frames).rgb.clamp(0, 1).cpu()
     moving = priors.instances[frames] > 0
-    wrong = (pictures - recorded).square().mean(-1)
-    shown = (drawn.rgb.clamp(0, 1) - recorded).square().mean(-1)
+    error = (rendering.rgb.clamp(0, 1) - recorded).square().mean(-1)
+    error_alone = (alone - recorded).square().mean(-1)
     sources = sources_of(scene, camera, frames)
-    account = Account(sources.count(moving), _mean_over(shown, moving), _mean_over(wrong, moving), len(held_out) > 0)
+    account = Account(
+        sources.count(moving), _mean_over(error, moving), _mean_over(error_alone, moving), len(held_out) > 0
+    )
     logger.info("%s", account_line(account))
     _log_instances(sources, priors.instances[frames])
     following = (frames + 1).clamp(max=total - 1)
@@ -90,12 +92,12 @@ def self_check(scene: DynamicScene, view: View, priors: Priors, held_out: Int[Te
         camera,
         recorded,
         priors.depth[frames],
-        drawn.depth,
-        shown.mean((1, 2)),
-        wrong.mean((1, 2)),
+        rendering.depth,
+        error.mean((1, 2)),
+        error_alone.mean((1, 2)),
         moving,
         account,
-        similarity(pictures, recorded),
+        similarity(alone, recorded),
         _track_residual(scene, view.camera, priors),
         flicker(recorded, view.rgb[following].float() / 255, still),
         max(priors.depth_traits.relative_error, unsteadiness(priors) if view.camera.is_static else 0.0),
@@ -122,11 +124,11 @@ def unsteadiness(priors: Priors) -> float:
     """
     frames = evenly(len(priors.depth), DEPTH_FRAMES)
     depth = priors.depth[frames]
-    known = (depth > 0) & (priors.instances[frames] == 0)
-    count = known.sum(0)
-    logarithm = depth.clamp(min=1e-6).log() * known
+    counted = (depth > 0) & (priors.instances[frames] == 0)
+    count = counted.sum(0)
+    logarithm = depth.clamp(min=1e-6).log() * counted
     mean = logarithm.sum(0) / count.clamp(min=1)
-    variance = ((logarithm - mean) * known).square().sum(0) / count.clamp(min=1)
+    variance = ((logarithm - mean) * counted).square().sum(0) / count.clamp(min=1)
     often = count > len(frames) / 2
     return float(variance[often].sqrt().median()) if bool(often.any()) else 0.0
 
@@ -139,7 +141,8 @@ def similarity(one: Float[Tensor, "t h w 3"], other: Float[Tensor, "t h w 3"]) -
 
 def stands_still(moving: Bool[Tensor, "t h w"]) -> Bool[Tensor, "t h w"]:
     """Pixels around which nothing moves."""
-    return torch.nn.functional.max_pool2d(moving.float(), STILL_PX, 1, STILL_PX // 2) == 0
+    reach = max(1, round(scaled_px(STILL_PX, moving.shape[2])))
+    return torch.nn.functional.max_pool2d(moving.float(), 2 * reach + 1, 1, reach) == 0
 
 
 def flicker(
@@ -158,24 +161,24 @@ def sharpness(pictures: Float[Tensor, "t h w 3"]) -> float:
 def _track_residual(scene: DynamicScene, camera: CameraTrack, priors: Priors) -> float:
     """Median distance (px) from where a tracked point is seen to where the motion carries it.
 
-    A point is carried as the Gaussian is that is drawn nearest to it where it was first seen.
+    A point is carried as the Gaussian is that is rendered nearest to it where it was first seen.
     """
     tracks = priors.tracks
     if len(tracks) == 0 or len(scene.moving) == 0:
         return 0.0
-    some = evenly(len(tracks), TRACKED)
-    visible, xy = tracks.visible[some], tracks.xy[some]
+    measured = evenly(len(tracks), TRACKED)
+    visible, xy = tracks.visible[measured], tracks.xy[measured]
     first = visible.long().argmax(1)
     times = evenly(scene.frames, TRACK_FRAMES)
-    drawn = {int(time): _projected(scene, camera, int(time)) for time in torch.cat((times, first.unique()))}
-    found = []
-    for point in range(len(some)):
+    gaussians = {int(time): _projected(scene, camera, int(time)) for time in torch.cat((times, first.unique()))}
+    distances = []
+    for point in range(len(measured)):
         start = int(first[point])
-        offset = drawn[start] - xy[point, start]
+        offset = gaussians[start] - xy[point, start]
         nearest = offset.square().sum(-1).argmin()
         for time in times[visible[point, times]].tolist():
-            found.append((drawn[time][nearest] - offset[nearest] - xy[point, time]).norm())
-    return float(torch.stack(found).median()) if found else 0.0
+            distances.append((gaussians[time][nearest] - offset[nearest] - xy[point, time]).norm())
+    return float(torch.stack(distances).median()) if distances else 0.0
 
 
 def _projected(scene: DynamicScene, camera: CameraTrack, time: int) -> Float[Tensor, "m 2"]:

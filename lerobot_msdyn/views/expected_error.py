@@ -1,7 +1,7 @@
 """The error to be expected of a new view of a scene, without ground truth.
 
 A new view is wrong by what the scene gets wrong in its own video, and by what only shows once the camera moves: where
-depth is wrong, a point is drawn some pixels from its place. How much that costs is read off the recorded picture: it
+depth is wrong, a point is rendered some pixels from its place. How much that costs is read off the recorded picture: it
 is compared with itself, shifted by as many pixels. Errors are mean squares of colours 0..1 and add up.
 """
 
@@ -50,19 +50,19 @@ def expected_error(check: SelfCheck, new: CameraTrack) -> Expected:
     """What is to be expected of a new camera, one pose per frame of the checked frames.
 
     Args:
-        check: what the scene says of its own video.
+        check: how well the scene explains its own video.
         new: the new camera at those frames, at any size.
     """
-    camera, known = check.camera, check.depth > 0
+    camera, measured = check.camera, check.depth > 0
     new = new.resized(camera.width, camera.height)
-    prior = torch.where(known, check.depth, check.drawn_depth)
+    prior = torch.where(measured, check.depth, check.rendered_depth)
     place = _seen_from(camera, new, prior)
-    drawn = (_seen_from(camera, new, check.drawn_depth) - place) * BETWEEN
+    rendered = (_seen_from(camera, new, check.rendered_depth) - place) * BETWEEN
     unsure = _seen_from(camera, new, prior * (1 + check.depth_error)) - place
-    within = torch.full_like(drawn, FINEST_PX)
+    within = torch.full_like(rendered, FINEST_PX)
     return Expected(
         check.error,
-        _misplaced(check.recorded, drawn * (known & (check.drawn_depth > 0))[..., None]),
+        _misplaced(check.recorded, rendered * (measured & (check.rendered_depth > 0))[..., None]),
         _misplaced(check.recorded, unsure * (prior > 0)[..., None]),
         _misplaced(check.recorded, within),
     )

@@ -21,12 +21,12 @@ from lerobot_msdyn.scene.sources import MovingPixels, moving_pixels_of_view
 from lerobot_msdyn.views.coverage import Coverage, coverage_of
 from lerobot_msdyn.views.expected_error import Expected, expected_error
 
-HEAT_WIDTH = 24  # columns of the map of what is unseen
+HEAT_WIDTH = 24  # columns of the map of what is uncovered
 CAUSES = {
     "video": "the scene does not match its own video (too few steps, wrong masks or motion)",
     "geometry": "the scene does not stand where the depth says (wrong masks, motion or depth)",
     "depth": "depth is known too roughly for so large a change of view",
-    "sampling": "the pictures are too fine to be drawn from elsewhere",
+    "sampling": "the pictures are too fine to be rendered from elsewhere",
 }
 
 
@@ -36,8 +36,8 @@ class FrameScores:
 
     frame: int  # of the episode
     expected_db: float  # expected peak signal-to-noise ratio
-    unseen: float  # share of the pixels that no frame has shown, 0..1
-    angle_deg: float  # mean angle between the new line of sight and the recorded one, where something is seen
+    unseen: float  # share of the pixels that is uncovered: no frame has shown it, 0..1
+    angle_deg: float  # mean angle between the new line of sight and the recorded one, where it is covered
     sharpness_ratio: float  # to the recorded frame
 
 
@@ -60,7 +60,7 @@ class Scores:
     flicker_ratio: float  # of what stands still, to the source's own
     sharpness_ratio: float
     frames: list[FrameScores]
-    heat: list[list[int]]  # percent of the judged frames in which a part of the picture is unseen
+    heat: list[list[int]]  # percent of the judged frames in which a part of the picture is uncovered
 
 
 @torch.no_grad()
@@ -68,27 +68,27 @@ def judge(windows: Sequence[FittedWindow], camera: CameraTrack) -> Scores:
     """Scores of an episode seen through another camera (any size, one pose per frame of the episode)."""
     frames: list[FrameScores] = []
     expected: list[Expected] = []
-    unseen, steady, own = [], 0.0, 0.0
+    uncovered, new_flicker, recorded_flicker = [], 0.0, 0.0
     moving = MovingPixels()
     for window in windows:
         check = window.self_check
         fitted = check.camera
         poses = camera.select(check.frames + window.start).resized(fitted.width, fitted.height)
         error = expected_error(check, poses)
-        drawn, found = _draw(window, poses)
+        rendering, coverages = _rendered(window, poses)
         moving += moving_pixels_of_view(window.scene, poses, check.frames, fitted, check.moving)
-        pictures = drawn.rgb.clamp(0, 1)
+        pictures = rendering.rgb.clamp(0, 1)
         after = (check.frames + 1).clamp(max=window.scene.frames - 1)
         following = to_device(render_scene(window.scene, poses, after), "cpu")
-        still = stands_still(drawn.moving > 0.05) & stands_still(following.moving > 0.05)
-        steady += len(poses) * flicker(pictures, following.rgb.clamp(0, 1), still)
-        own += len(poses) * check.flicker
+        still = stands_still(rendering.moving > 0.05) & stands_still(following.moving > 0.05)
+        new_flicker += len(poses) * flicker(pictures, following.rgb.clamp(0, 1), still)
+        recorded_flicker += len(poses) * check.flicker
         expected.append(error)
-        unseen += [coverage.unseen for coverage in found]
-        for i, (frame, coverage) in enumerate(zip(check.frames.tolist(), found, strict=True)):
+        uncovered += [coverage.unseen for coverage in coverages]
+        for i, (frame, coverage) in enumerate(zip(check.frames.tolist(), coverages, strict=True)):
             ratio = sharpness(pictures[i : i + 1]) / max(sharpness(check.recorded[i : i + 1]), 1e-9)
-            seen = ~coverage.unseen
-            angle = float(coverage.angle_deg[seen].mean()) if seen.any() else 180.0
+            covered = ~coverage.unseen
+            angle = float(coverage.angle_deg[covered].mean()) if covered.any() else 180.0
             frames.append(
                 FrameScores(frame + window.start, decibels(float(error.total[i])), coverage.unseen_share, angle, ratio)
             )
@@ -108,19 +108,19 @@ def judge(windows: Sequence[FittedWindow], camera: CameraTrack) -> Scores:
         float(np.mean([frame.unseen for frame in frames])),
         float(np.mean([frame.angle_deg for frame in frames])),
         float(np.mean([check.track_px for check in checks])),
-        steady / own if own > 0 else 1.0,
+        new_flicker / recorded_flicker if recorded_flicker > 0 else 1.0,
         float(np.mean([frame.sharpness_ratio for frame in frames])),
         frames,
-        _heat(np.mean(unseen, axis=0)),
+        _heat(np.mean(uncovered, axis=0)),
     )
 
 
 def reasons(scores: Scores, config: GateConfig) -> list[str]:
     """Why a view is not kept, in words; empty if it is."""
     worst = max(scores.causes, key=lambda name: scores.causes[name])
-    found = []
+    why = []
     if scores.expected_db < config.min_expected_db:
-        found.append(
+        why.append(
             f"expected quality {scores.expected_db:.1f} dB is under gate.min_expected_db {config.min_expected_db:g}: "
             f"{CAUSES[worst]}"
         )
@@ -129,13 +129,13 @@ def reasons(scores: Scores, config: GateConfig) -> list[str]:
         (scores.flicker_ratio, config.max_flicker_ratio, "max_flicker_ratio", "times the video's own flicker"),
     ):
         if value > limit:
-            found.append(f"{value:.1f} {text}, over gate.{name} {limit:g}")
+            why.append(f"{value:.1f} {text}, over gate.{name} {limit:g}")
     if scores.sharpness_ratio < config.min_sharpness_ratio:
-        found.append(
+        why.append(
             f"{scores.sharpness_ratio:.2f} of the video's sharpness, under gate.min_sharpness_ratio "
             f"{config.min_sharpness_ratio:g}"
         )
-    return found
+    return why
 
 
 def record(scores: Scores) -> dict[str, Any]:
@@ -153,15 +153,15 @@ def _plain(value: Any) -> Any:
     return {name: _plain(item) for name, item in vars(value).items()} if isinstance(value, FrameScores) else value
 
 
-def _draw(window: FittedWindow, poses: CameraTrack) -> tuple[Rendering, list[Coverage]]:
+def _rendered(window: FittedWindow, poses: CameraTrack) -> tuple[Rendering, list[Coverage]]:
     """The checked frames through other poses, and what is known about their pixels; on the host."""
-    drawn = render_scene(window.scene, poses, window.self_check.frames, extra=window.evidence.moving_frames)
-    return to_device(drawn, "cpu"), coverage_of(drawn, poses, window.self_check.frames, window.evidence)
+    rendering = render_scene(window.scene, poses, window.self_check.frames, extra=window.evidence.moving_frames)
+    return to_device(rendering, "cpu"), coverage_of(rendering, poses, window.self_check.frames, window.evidence)
 
 
-def _heat(unseen: Float[ndarray, "h w"]) -> list[list[int]]:
+def _heat(uncovered: Float[ndarray, "h w"]) -> list[list[int]]:
     """A small map of shares, in percent."""
-    height, width = unseen.shape
+    height, width = uncovered.shape
     size = (HEAT_WIDTH, max(1, round(HEAT_WIDTH * height / width)))
-    small = cv2.resize(unseen.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(uncovered.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     return [[round(100 * float(value)) for value in row] for row in small]

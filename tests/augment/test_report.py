@@ -95,7 +95,7 @@ def entry(episode: int = 0, **changes: Any) -> ViewEntry:
 def test_every_text_is_escaped() -> None:
     pictures = Pictures("data:image/jpeg;base64,", "data:image/jpeg;base64,", 3, 2.0, None)
     entries = [
-        entry(camera=NASTY, drawn={NASTY: 1.0}, rejected=[NASTY], pictures=pictures),
+        entry(camera=NASTY, amounts={NASTY: 1.0}, rejected=[NASTY], pictures=pictures),
         entry(camera=NASTY, rejected=[NASTY], dropped=True),
     ]
     text = page(NASTY, {NASTY: NASTY}, entries, [NASTY])

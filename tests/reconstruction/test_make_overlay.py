@@ -10,10 +10,11 @@ from lerobot_msdyn.core.cameras import CameraTrack, intrinsics_from_fov, static_
 from lerobot_msdyn.core.observations import DepthTraits, View
 from lerobot_msdyn.motion.model.bases import identity_level
 from lerobot_msdyn.priors import PointTracks, Priors
+from lerobot_msdyn.reconstruction import make_overlay
 from lerobot_msdyn.reconstruction.background import background_gaussians, pixel_gaussians
 from lerobot_msdyn.reconstruction.make_overlay import unexplained
 from lerobot_msdyn.scene.dynamic import DynamicScene
-from lerobot_msdyn.scene.rendering import render_scene
+from lerobot_msdyn.scene.rendering import Rendering, render_scene
 from lerobot_msdyn.scene.store import load_scene, save_scene
 from lerobot_msdyn.views.offsets import orbit_offset
 
@@ -107,6 +108,25 @@ def test_what_motion_explains_is_left_to_it(recorded: tuple[DynamicScene, View, 
     assert len(right) < 0.2 * len(wrong)
     assert right.hidden[len(scene.static) :].float().mean() < 0.5  # the square is where it was believed to be
     assert wrong.hidden[len(scene.static) :].float().mean() > 0.9
+
+
+def test_the_same_is_unexplained_at_any_size() -> None:
+    """A moving square whose left border has another colour: what lies near it is condemned with it."""
+    shares = []
+    for width in (160, 320, 640):
+        height, unit = 3 * width // 4, width // 160
+        recorded, rendered = torch.full((height, width, 3), 0.5), torch.full((1, height, width, 3), 0.5)
+        rendered[0, 40 * unit : 80 * unit, 40 * unit : 44 * unit] = 0.8  # 4 of 160 px
+        rendered[0, 90 * unit : 96 * unit, 10 * unit : 16 * unit] = 0.66  # of what stands still
+        moving = torch.zeros(1, height, width)
+        moving[0, 40 * unit : 80 * unit, 40 * unit : 120 * unit] = 1
+        depth = torch.ones(1, height, width)
+        wrong = make_overlay._wrong(Rendering(rendered, depth, depth, moving), recorded, depth[0].numpy(), 0.02)
+        shares.append((float(wrong[40 * unit : 80 * unit].mean()), float(wrong[86 * unit :].mean())))
+    for first, second in shares[1:]:
+        assert first == pytest.approx(shares[0][0], rel=0.1)
+        assert second == pytest.approx(shares[0][1], rel=0.3)  # a pixel along its border is added at any size
+    assert shares[0][0] * 160 > 4 + 8, "more than the border itself"
 
 
 def test_overlays_are_saved(recorded: tuple[DynamicScene, View, Priors], tmp_path: Path) -> None:

@@ -160,9 +160,10 @@ def test_measures() -> None:
     assert similarity(pictures, pictures) == pytest.approx(1, abs=1e-4)
     assert similarity(pictures, 1 - pictures) < 0.2
     assert sharpness(pictures) > 10 * sharpness(0.1 * pictures)
-    moving = torch.zeros(1, 9, 9, dtype=torch.bool)
-    moving[0, 4, 4] = True
-    assert stands_still(moving).sum() == 81 - 25
+    for width, side in ((320, 5), (640, 9), (160, 3), (64, 3)):  # the same part of the picture, and a pixel at least
+        moving = torch.zeros(1, 20, width, dtype=torch.bool)
+        moving[0, 10, 30] = True
+        assert stands_still(moving).sum() == 20 * width - side**2
     assert flicker(pictures, pictures + 0.1, torch.ones(2, 24, 32, dtype=torch.bool)) == pytest.approx(0.1)
     assert flicker(pictures, pictures + 0.1, torch.zeros(2, 24, 32, dtype=torch.bool)) == 0
     assert decibels(0.01) == pytest.approx(20)

@@ -72,10 +72,12 @@ def entries_of(episodes: Sequence[NewEpisode]) -> tuple[list[ViewEntry], dict[in
             for camera, view in origin.gate["views"].items():
                 if not episode.dropped:
                     places[len(entries)] = index
-                drawn, rejected = origin.perturbation[camera], origin.gate["rejected"]
+                amounts, rejected = origin.perturbation[camera], origin.gate["rejected"]
                 view = view | origin.views[camera]
                 dropped = bool(episode.dropped)
-                entries.append(ViewEntry(episode.source_index, origin.variant, camera, drawn, view, rejected, dropped))
+                entries.append(
+                    ViewEntry(episode.source_index, origin.variant, camera, amounts, view, rejected, dropped)
+                )
         index += not episode.dropped
     return entries, places
 

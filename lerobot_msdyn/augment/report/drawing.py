@@ -35,9 +35,9 @@ def cameras_from_above(cameras_from_source: Sequence[Sequence[Sequence[float]]],
         )
 
     x, y = at(np.array([0, distance])).split(",")
-    drawn = "".join(camera(pose, "new") for pose in new) + camera(np.eye(4), "recorded")
+    shapes = "".join(camera(pose, "new") for pose in new) + camera(np.eye(4), "recorded")
     return (
-        f'<svg viewBox="0 0 {SIZE} {SIZE}" role="img" aria-label="camera poses from above">{drawn}'
+        f'<svg viewBox="0 0 {SIZE} {SIZE}" role="img" aria-label="camera poses from above">{shapes}'
         f'<circle class="target" cx="{x}" cy="{y}" r="4"/></svg>'
     )
 

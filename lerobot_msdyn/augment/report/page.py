@@ -9,7 +9,7 @@ from lerobot_msdyn.augment.report.drawing import cameras_from_above
 from lerobot_msdyn.reconstruction.account import Account, account_sentence, pooled
 
 LISTED = 1000  # rows of the table, at most
-DRAWN_POSES = 8  # of a camera that moves along the episode, about
+SHOWN_POSES = 8  # of a camera that moves along the episode, about
 STYLE = """
 :root{--ink:#1c2330;--soft:#5c6675;--line:#dde2e8;--paper:#fff;--back:#f5f6f8;--new:#c2351f;--good:#1d7a46}
 *{box-sizing:border-box}
@@ -58,7 +58,7 @@ NAMES = {
     "moving_db": ("dynamic PSNR without overlay", "{:.1f} dB"),
     "by_motion": ("moving pixels by motion", "{:.0%}"),
     "by_overlay": ("moving pixels by overlay", "{:.0%}"),
-    "unseen": ("never seen", "{:.1%}"),
+    "unseen": ("uncovered", "{:.1%}"),
     "angle_deg": ("change of the line of sight", "{:.1f}°"),
     "track_px": ("tracks to motion", "{:.1f} px"),
     "flicker_ratio": ("flicker, of the video's", "{:.2f}"),
@@ -84,7 +84,7 @@ class ViewEntry:
     episode: int  # of the source
     variant: int
     camera: str
-    drawn: dict[str, float]  # the change of view
+    amounts: dict[str, float]  # the change of view
     view: dict[str, Any]  # camera_from_source, distance_m, what_moves, and scores if it was judged
     rejected: list[str]  # reasons of the samples before
     dropped: bool
@@ -128,10 +128,10 @@ def page(title: str, figures: dict[str, str], entries: Sequence[ViewEntry], skip
 
 def accounts_of(entries: Iterable[ViewEntry]) -> dict[str, Account]:
     """Per camera, what renders the moving pixels of its recorded view, over all episodes."""
-    found = {(entry.camera, entry.episode): Account.from_entry(entry.view["what_moves"]) for entry in entries}
+    accounts = {(entry.camera, entry.episode): Account.from_entry(entry.view["what_moves"]) for entry in entries}
     return {
-        camera: pooled([account for (name, _), account in found.items() if name == camera])
-        for camera in dict.fromkeys(camera for camera, _ in found)
+        camera: pooled([account for (name, _), account in accounts.items() if name == camera])
+        for camera in dict.fromkeys(camera for camera, _ in accounts)
     }
 
 
@@ -161,7 +161,7 @@ def _article(entry: ViewEntry) -> str:
 
 
 def _pictures(entry: ViewEntry) -> str:
-    change = text(", ".join(_with_unit(name, value) for name, value in entry.drawn.items()))
+    change = text(", ".join(_with_unit(name, value) for name, value in entry.amounts.items()))
     above = (
         f"<figure>{cameras_from_above(_poses(entry.view['camera_from_source']), entry.view['distance_m'])}"
         f"<figcaption>From above: recorded camera grey, new one red. {change}</figcaption></figure>"
@@ -172,8 +172,8 @@ def _pictures(entry: ViewEntry) -> str:
     heat = ""
     if pictures.heat:
         heat = (
-            f'<figure><img src="{pictures.heat}" alt="where the new view shows what nobody has seen">'
-            "<figcaption>Red: never seen, filled in</figcaption></figure>"
+            f'<figure><img src="{pictures.heat}" alt="where the new view shows what no frame has shown">'
+            "<figcaption>Red: uncovered, filled in</figcaption></figure>"
         )
     return (
         f'<figure class="strip"><img src="{pictures.strip}" alt="recorded above, new below"></figure>'
@@ -186,12 +186,12 @@ def _pictures(entry: ViewEntry) -> str:
 
 def _poses(matrices: list[Any]) -> list[Any]:
     """A few of a camera's poses: one, or some along an episode in which it moves."""
-    every = max(1, len(matrices) // DRAWN_POSES)
+    every = max(1, len(matrices) // SHOWN_POSES)
     return matrices[::every] if isinstance(matrices[0][0], list) else [matrices]
 
 
 def _with_unit(name: str, value: float) -> str:
-    """What was drawn, in words: its name ends in its unit."""
+    """What was sampled, in words: its name ends in its unit."""
     for ending, unit in (("_deg", "°"), ("_m", " m"), ("_rel", " of the distance")):
         if name.endswith(ending):
             return f"{name.removesuffix(ending).replace('_', ' ')} {value:.3g}{unit}"
@@ -212,13 +212,13 @@ def _frames(frames: Sequence[dict[str, Any]]) -> str:
         f"<td>{frame['angle_deg']:.1f}°</td><td>{frame['sharpness_ratio']:.2f}</td></tr>"
         for frame in frames
     )
-    head = "<tr><th>frame</th><th>expected</th><th>never seen</th><th>angle</th><th>sharpness</th></tr>"
+    head = "<tr><th>frame</th><th>expected</th><th>uncovered</th><th>angle</th><th>sharpness</th></tr>"
     return f'<details><summary>Judged frames</summary><div class="scroll"><table>{head}{rows}</table></div></details>'
 
 
 def _table(entries: Sequence[ViewEntry]) -> str:
     head = (
-        "<tr><th>episode</th><th>variant</th><th>camera</th><th>expected</th><th>never seen</th><th>by motion</th>"
+        "<tr><th>episode</th><th>variant</th><th>camera</th><th>expected</th><th>uncovered</th><th>by motion</th>"
         "<th>by overlay</th><th>dynamic PSNR</th><th>without overlay</th><th>resampled</th><th>verdict</th></tr>"
     )
     rows = []

@@ -1,4 +1,4 @@
-"""The pictures of the report, as data URLs: strips, clips and maps of what was never seen."""
+"""The pictures of the report, as data URLs: strips, clips and maps of what is uncovered."""
 
 import base64
 from collections.abc import Sequence
@@ -48,12 +48,12 @@ def film(before: Sequence[ndarray], after: Sequence[ndarray]) -> UInt8[ndarray, 
 
 
 def heat_map(picture: UInt8[ndarray, "h w 3"], percent: Sequence[Sequence[int]]) -> UInt8[ndarray, "height width 3"]:
-    """A new picture in grey, red where the frames show what nobody has seen."""
+    """A new picture in grey, red where the frames show what no recorded frame has shown."""
     small = _narrowed(picture, STRIP_WIDTH)
     height, width = small.shape[:2]
-    share = cv2.resize(np.asarray(percent, np.float32) / 100, (width, height), interpolation=cv2.INTER_LINEAR)
+    uncovered = cv2.resize(np.asarray(percent, np.float32) / 100, (width, height), interpolation=cv2.INTER_LINEAR)
     grey = np.repeat(small.mean(-1, keepdims=True), 3, axis=-1) * 0.7 + 60
-    weight = 0.85 * share.clip(0, 1)[..., None]
+    weight = 0.85 * uncovered.clip(0, 1)[..., None]
     return (grey * (1 - weight) + np.array([214, 40, 40]) * weight).clip(0, 255).astype(np.uint8)
 
 
