@@ -18,7 +18,7 @@ SAYS = {
     "06_held_out_camera.py": r"(?s)\d dB\n.*\d dB\n",
     "07_export_scene.py": r"frame_000000.ply to frame_000007.ply",
     "08_own_motion_level.py": r"\d parts, [1-9]\d* cells, \d+ moving Gaussians",
-    "10_own_loss.py": r"weight 0: longest axis .*\nweight 0.01: longest axis",
+    "10_own_loss.py": r"(?s)weight 0: longest axis .*\nweight 0.01: longest axis",
     "09_own_depth.py": r"'provider': 'two_walls', 'why': 'asked for; walls at 0.96 and 1.2 m', 'model': 'me/two-walls'",
 }
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import DatasetError, EpisodeError
-from lerobot_msdyn.core.sampling import evenly
+from lerobot_msdyn.core.sampling import evenly, scaled_px
 from lerobot_msdyn.dataset.read import Episode, read_episode
 from lerobot_msdyn.priors.camera.steadiness import SWAY_PX, camera_motion_px
 
@@ -69,7 +69,7 @@ def why_moving(episode: Episode, key: str) -> str:
     camera that moves without the robot's doing (held in a hand) is not tied to the state.
     """
     rgb = episode.views[key].rgb
-    motion = camera_motion_px(rgb)
+    motion = camera_motion_px(rgb) / scaled_px(1, rgb.shape[2])
     if motion <= SWAY_PX:
         return ""
     if episode.state is None:

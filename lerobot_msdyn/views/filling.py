@@ -13,14 +13,13 @@ from torch import Tensor
 
 from lerobot_msdyn.core.config import Fill
 from lerobot_msdyn.core.images import nearest_of
-from lerobot_msdyn.core.sampling import scaled_px
 from lerobot_msdyn.views.coverage import HOLE_ALPHA
 
 SOLID_ALPHA = 0.9  # from this opacity on a surface is shown as it is; below, what is behind shines through
 INPAINT_RADIUS_PX = 3  # of the grid: Telea's method continues lines from so near
 NEARER = 0.07  # share of its depth by which a surface beside a hole is nearer than the farthest there
-MARGIN_PX = 3  # of 320
-MAX_REACH_PX = 21  # of 320, about a hole, in which surfaces are compared
+MARGIN_PX = 3
+MAX_REACH_PX = 21  # about a hole, in which surfaces are compared
 COARSER = 4  # soft filling works at a quarter of the size
 SMALLEST_PX = 2  # its pyramid ends where a side is so short
 
@@ -95,8 +94,7 @@ def _hiding(holes: Bool[ndarray, "h w"], depth: Float[ndarray, "h w"]) -> Bool[n
     if not inner.any():
         return np.zeros_like(holes)
     width = round(2 * float(cv2.distanceTransform(inner.astype(np.uint8), cv2.DIST_L2, 3).max()))
-    margin, farthest_px = (max(1, round(scaled_px(px, holes.shape[1]))) for px in (MARGIN_PX, MAX_REACH_PX))
-    reach = min(width + margin, farthest_px)
+    reach = min(width + MARGIN_PX, MAX_REACH_PX)
     around, across = (np.ones((2 * size + 1,) * 2, np.uint8) for size in (reach, 2 * reach))
     farthest = cv2.dilate(np.where(holes, np.float32(0), depth.astype(np.float32)), across)
     beside = cv2.dilate(inner.astype(np.uint8), around) > 0

@@ -18,6 +18,7 @@ from lerobot_msdyn.core.cli import parse_config
 from lerobot_msdyn.core.config import RIVAL_LEVELS, MotionConfig
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.core.fields import problems
+from lerobot_msdyn.core.registries import MOTION_LEVELS
 from lerobot_msdyn.motion.estimate import motion_from_tracks
 from lerobot_msdyn.motion.from_tracks.lift import LiftedTracks
 from lerobot_msdyn.motion.model.bases import level_from_motions
@@ -34,7 +35,7 @@ def field(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """The module of the deformation field; both models are registered."""
     monkeypatch.syspath_prepend(PROJECT / "benchmarks")
     importlib.import_module("rivals").register()
-    return sys.modules["field"]
+    return sys.modules[MOTION_LEVELS.get("field").__module__]
 
 
 def bent() -> tuple[torch.Tensor, torch.Tensor]:

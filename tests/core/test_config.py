@@ -173,7 +173,7 @@ ALL_CLASSES = sorted({part for kind in CONFIGS.values() for part in with_parts(k
 def test_the_configs_of_all_commands_are_looked_at() -> None:
     assert set(COMMANDS.values()) <= set(CONFIGS)
     names = {kind.__name__ for kind in ALL_CLASSES}
-    assert {"Recipe", "FitConfig", "FramesPerKnot", "Orbit", "Drift"} <= names
+    assert {"Recipe", "FitConfig", "MotionConfig", "Orbit", "Drift"} <= names
 
 
 def test_every_field_is_read_somewhere() -> None:

@@ -30,12 +30,12 @@ def test_a_pixel_becomes_a_world_point() -> None:
 
 
 def test_depth_edges_and_unknown_depth_are_refused() -> None:
-    depth = torch.full((6, 48, 64), 2.0)
-    depth[:, :, 32:] = 1.0
+    depth = torch.full((6, 48, 320), 2.0)
+    depth[:, :, 160:] = 1.0
     depth[:, 40:] = 0.0
-    camera = static_camera(K, 6, 64, 48)
-    # pixel columns 30..33 are within two pixels of the edge between columns 31 and 32
-    points = [(29.5, 20.5), (30.5, 20.5), (33.5, 20.5), (34.5, 20.5), (10.5, 44.5), (10.5, 39.5)]
+    camera = static_camera(K, 6, 320, 48)
+    # pixel columns 158..161 are within two pixels of the edge between columns 159 and 160
+    points = [(157.5, 20.5), (158.5, 20.5), (161.5, 20.5), (162.5, 20.5), (10.5, 44.5), (10.5, 39.5)]
     _, valid = lift_tracks(tracks_at(points, 6), depth, camera)
     assert valid.all(1).tolist() == [True, False, False, True, False, True]
 

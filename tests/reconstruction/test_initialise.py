@@ -1,6 +1,8 @@
 """From priors to a scene: what moves is gathered from many frames into one canonical frame."""
 
 import dataclasses
+import importlib
+from pathlib import Path
 
 import pytest
 import torch
@@ -82,7 +84,11 @@ def test_isotropic_gaussians_are_balls(pushed: tuple[View, Priors]) -> None:
 
 
 @pytest.mark.parametrize("levels", [["object", "primitive"], ["flat"], ["field"]])
-def test_every_model_of_motion_shows_the_video(pushed: tuple[View, Priors], levels: list) -> None:
+def test_every_model_of_motion_shows_the_video(
+    pushed: tuple[View, Priors], levels: list, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "benchmarks")
+    importlib.import_module("rivals").register()
     scene = initialise(*pushed, SceneConfig(), MotionConfig(levels=levels))
     assert len(scene.levels) == len(levels)
     assert psnr(scene, pushed[0], torch.arange(FRAMES)) > 16

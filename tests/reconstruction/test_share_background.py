@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from lerobot_msdyn.augment import backgrounds
 from lerobot_msdyn.augment.backgrounds import shared_backgrounds
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import PriorError
@@ -31,7 +32,7 @@ def test_a_background_is_fitted_once(desk: Path, tmp_path: Path, monkeypatch: py
         asked.append(arguments)
         return torch.zeros(12, 48, 64, dtype=torch.uint8)
 
-    monkeypatch.setattr(sharing, "moving_in_few", nothing_moves)
+    monkeypatch.setattr(backgrounds, "moving_in_few", nothing_moves)
     (again,) = shared_backgrounds(source, [FRONT], settings)[FRONT]
     assert asked == []
     assert first.static is not None

@@ -117,7 +117,7 @@ def test_what_is_made_of_a_fit(gpu: FakeGpu) -> None:
     assert len(pictures) == len(filled) == len(shares) == FRAMES
     assert np.isfinite(scores.expected_db)
     waits.pop("scene/overlay.py _first")
-    assert waits == {"scene/gaussians.py patched": FRAMES, "motion/model/bases.py _moves": 1}
+    assert waits == {"scene/dynamic.py patched": FRAMES, "motion/model/bases.py _moves": 1}
     batches = -(-FRAMES // 8)
     assert copies == {"core/serialise.py to_device": 4 * FRAMES + 2 * batches}  # coverage; pictures and depth
 

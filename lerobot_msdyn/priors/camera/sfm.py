@@ -16,7 +16,7 @@ from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.errors import PriorError
 from lerobot_msdyn.core.geometry import matrix_to_quaternion, quaternion_to_matrix
 from lerobot_msdyn.core.observations import View
-from lerobot_msdyn.core.sampling import evenly
+from lerobot_msdyn.core.sampling import evenly, scaled_px
 from lerobot_msdyn.priors.camera.steadiness import FIXED_PX, camera_motion_px
 from lerobot_msdyn.priors.hub import demand_library
 from lerobot_msdyn.priors.registry import Unusable
@@ -35,7 +35,7 @@ def camera_from_sfm(view: View, instances: UInt8[Tensor, "t h w"]) -> CameraTrac
         PriorError: pycolmap is absent, the camera does not move, or too few frames could be registered.
     """
     demand_library("pycolmap", "sfm", "structure from motion")
-    motion = camera_motion_px(view.rgb, instances > 0)
+    motion = camera_motion_px(view.rgb, instances > 0) / scaled_px(1, view.camera.width)
     if motion < FIXED_PX:
         raise Unusable(
             f"the camera does not move ({motion:.2f} px): there is no parallax to reconstruct from",

@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float32, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from lerobot_msdyn.core.sampling import REFERENCE_WIDTH, evenly
+from lerobot_msdyn.core.sampling import evenly
 
 FIXED_PX = 0.5  # of 320: a camera whose picture moves less is fixed
 SWAY_PX = 3.0  # of 320: up to this it is taken as fixed; the masks allow for such a sway
@@ -17,7 +17,7 @@ _RETURN_PX = 0.5  # difference of a corner to itself, followed there and back
 
 
 def camera_motion_px(rgb: UInt8[Tensor, "t h w 3"], moving: Bool[Tensor, "t h w"] | None = None) -> float:
-    """Median motion (px of a picture 320 wide) of features over a twentieth of the clip, but those on `moving`.
+    """Median motion (px) of the picture's features over a twentieth of the clip; features on `moving` do not count.
 
     Where too few features can be followed, phase correlation of the whole pictures decides.
     """
@@ -25,7 +25,7 @@ def camera_motion_px(rgb: UInt8[Tensor, "t h w 3"], moving: Bool[Tensor, "t h w"
     grey = [cv2.cvtColor(rgb[int(frame)].numpy(), cv2.COLOR_RGB2GRAY) for frame in frames]
     masks = [_usable(moving, int(frame), grey[0].shape) for frame in frames]
     motions = [_motion_px(grey[i], grey[i + 1], masks[i]) for i in range(len(frames) - 1)]
-    return float(np.median(motions)) * REFERENCE_WIDTH / rgb.shape[2] if motions else 0.0
+    return float(np.median(motions)) if motions else 0.0
 
 
 def _usable(moving: Bool[Tensor, "t h w"] | None, frame: int, shape: tuple[int, ...]) -> UInt8[ndarray, "h w"]:

@@ -4,6 +4,7 @@ import logging
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.fields import AUTO
+from lerobot_msdyn.core.sampling import scaled_px
 from lerobot_msdyn.priors.camera.steadiness import FIXED_PX, SWAY_PX, camera_motion_px
 from lerobot_msdyn.priors.registry import CAMERAS, CameraProvider, Estimate, Masks
 from lerobot_msdyn.priors.request import Request
@@ -20,7 +21,7 @@ class Fixed(CameraProvider):
     def estimate(self, request: Request, instances: Masks) -> Estimate[CameraTrack]:
         """A camera that moves although nobody stated that it is fixed is named in a warning."""
         camera = request.view.camera
-        motion = camera_motion_px(request.view.rgb, instances > 0)
+        motion = camera_motion_px(request.view.rgb, instances > 0) / scaled_px(1, request.view.camera.width)
         if motion > SWAY_PX and camera.is_static and request.camera.poses == AUTO:
             logger.warning(
                 "camera: the picture of %s moves by %.1f px between frames that are a twentieth of the clip apart, "
