@@ -138,12 +138,10 @@ def differences(scene: Reconstruction, truth: Truth, name: str) -> Iterator[str]
     rendered = np.stack([picture.rgb for picture in shown])
     everywhere, moving = truth.psnr_db(rendered, truth.covered), truth.psnr_db(rendered, truth.covered & truth.moving)
     limit, dynamic_limit = LIMITS_DB[name]
-    print("CHECK", name, everywhere, moving)
     if everywhere < limit:
         yield f"{name}: PSNR {everywhere:.1f} dB"
     if moving < dynamic_limit:
         yield f"{name}: dynamic PSNR {moving:.1f} dB"
-    print("CHECK unc", np.mean([picture.unseen for picture in shown]), (~truth.covered).mean())
     off = np.mean([picture.unseen for picture in shown]) - (~truth.covered).mean()
     if abs(off) > COVERED:
         yield f"{name}: uncovered share off by {off:+.3f}"
@@ -164,7 +162,6 @@ def motion_fails(case: Case, scene: Reconstruction) -> Iterator[str]:
         errors.append((carried - tracks.positions[point]).norm(dim=-1)[tracks.visible[point]])
     error = torch.cat(errors)
     median, most = float(error.median()), float(error.quantile(0.9))
-    print("CHECK motion", median, most)
     if median > MEDIAN_M or most > MOST_M:
         yield f"motion off by {1000 * median:.1f} mm, nine of ten points by less than {1000 * most:.1f} mm"
 
@@ -198,7 +195,6 @@ def gate_fails(case: Case, scene: Reconstruction) -> Iterator[str]:
         gate.judge(scene.windows, turned_right(case.scene.camera, degrees, scene.distance))
         for degrees in (NEAR_DEG, FAR_DEG)
     )
-    print("CHECK gate", near.expected_db, far.expected_db)
     if gate.reasons(near, GATE):
         yield f"gate rejects a good view: {gate.reasons(near, GATE)[0]}"
     if not gate.reasons(far, GATE):
@@ -208,7 +204,6 @@ def gate_fails(case: Case, scene: Reconstruction) -> Iterator[str]:
 def check(case: Case, scene: Reconstruction) -> None:
     """The assertion that mutants must fail."""
     failed = failures(case, scene)
-    print("CHECK", failed)
     assert not failed, "; ".join(failed)
 
 

@@ -91,11 +91,11 @@ def test_nothing_is_added_where_all_is_explained(recorded: tuple[DynamicScene, V
     ("traits", "contradicts"), [(DepthTraits(metric=True), True), (DepthTraits(assumed=True), False)]
 )
 def test_depth_that_is_only_assumed_contradicts_nothing(
-    recorded: tuple[DynamicScene, View, Priors], traits: DepthTraits, contradicts: bool
+    recorded: tuple[DynamicScene, View, Priors], traits: dict, contradicts: bool
 ) -> None:
     scene, view, priors = recorded
     wall = dataclasses.replace(view, rgb=view.rgb * 0 + 120)
-    nearer = dataclasses.replace(priors, depth=torch.full_like(priors.depth, NEAR), depth_traits=traits)
+    nearer = dataclasses.replace(priors, depth=torch.full_like(priors.depth, NEAR), depth_traits=DepthTraits(**traits))
     without = DynamicScene(scene.static, scene.moving.select(slice(0, 0)), (), (), (), FRAMES)
     assert (len(unexplained(without, wall, nearer).means) > 0) is contradicts
 
