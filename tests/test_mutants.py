@@ -19,6 +19,7 @@ from torch import Tensor
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.config import GateConfig, Recipe
 from lerobot_msdyn.core.observations import PointTracks, Priors, View
+from lerobot_msdyn.motion.model.bases import MotionLevel
 from lerobot_msdyn.priors.exchange import from_priors, write_exchange
 from lerobot_msdyn.reconstruction.reconstruct import STEPS, Draft, Step, reconstruct, with_steps
 from lerobot_msdyn.reconstruction.result import Reconstruction
@@ -26,6 +27,7 @@ from lerobot_msdyn.scene.overlay import Overlay, packed
 from lerobot_msdyn.synthetic import SyntheticScene, SyntheticTracks, covisibility, heldout_cameras, make_scene
 from lerobot_msdyn.views import gate, offsets, pictures
 from lerobot_msdyn.views.new_cameras import new_cameras
+from lerobot_msdyn.views.perturbations.orbit import Orbit
 from lerobot_msdyn.views.pictures import new_pictures
 
 pytestmark = pytest.mark.slow
@@ -168,7 +170,7 @@ def motion_fails(case: Case, scene: Reconstruction) -> Iterator[str]:
 
 def sampled_cameras_fail(case: Case, scene: Reconstruction) -> Iterator[str]:
     """The pictures of a new episode show what a camera sees that is placed where the record says, by other code."""
-    recipe = replace(case.recipe, perturbation=replace(case.recipe.perturbation, elevation_deg=0.0, translation_m=0.0))
+    recipe = replace(case.recipe, perturbation=Orbit(elevation_deg=0.0, translation_m=0.0))
     sampled = new_cameras({KEY: scene}, recipe, 0, VARIANT)
     degrees = sampled.amounts[KEY]["azimuth_deg"]
     assert abs(degrees) > 5
@@ -214,17 +216,22 @@ def test_the_honest_pipeline_passes(case: Case, *, overlay: bool) -> None:
 
 def identity_motion(case: Case, draft: Draft) -> None:
     """Nothing moves."""
-    still = [torch.tensor([1.0, 0, 0, 0, 1, 0]).expand_as(level.rotations_6d) for level in draft.scene.levels]
+    still = [torch.tensor([1.0, 0, 0, 0, 1, 0]).expand_as(level.rotations_6d) for level in bases(draft)]
     levels = tuple(
         replace(level, rotations_6d=rotation, displacements=torch.zeros_like(level.displacements))
-        for level, rotation in zip(draft.scene.levels, still, strict=True)
+        for level, rotation in zip(bases(draft), still, strict=True)
     )
     draft.scene = replace(draft.scene, levels=levels)
 
 
+def bases(draft: Draft) -> list[MotionLevel]:
+    """Its levels, all of which are of bases."""
+    return [level for level in draft.scene.levels if isinstance(level, MotionLevel)]
+
+
 def late_motion(case: Case, draft: Draft) -> None:
     """All motion comes one frame late."""
-    levels = tuple(replace(level, knots=level.knots + 1) for level in draft.scene.levels)
+    levels = tuple(replace(level, knots=level.knots + 1) for level in bases(draft))
     draft.scene = replace(draft.scene, levels=levels)
 
 
@@ -232,7 +239,7 @@ def shifts_alone(case: Case, draft: Draft) -> None:
     """What moves does not turn."""
     levels = tuple(
         replace(level, rotations_6d=torch.tensor([1.0, 0, 0, 0, 1, 0]).expand_as(level.rotations_6d))
-        for level in draft.scene.levels
+        for level in bases(draft)
     )
     draft.scene = replace(draft.scene, levels=levels)
 
