@@ -20,6 +20,7 @@ from lerobot.datasets import LeRobotDataset
 from lerobot_msdyn.augment import __main__ as augment
 from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.core import plugins
+from lerobot_msdyn.core import registry as registry_module
 from lerobot_msdyn.core.cli import format_help, load_recipe, parse_config
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.core.perturbation import PERTURBATIONS, Perturbation
@@ -129,6 +130,7 @@ def test_installed_packages_bring_kinds_by_entry_points(tmp_path: Path, monkeypa
     (tmp_path / "shaking-1.0.dist-info" / "entry_points.txt").write_text(points)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(PERTURBATIONS, "_registered", dict(PERTURBATIONS._registered))
+    monkeypatch.setattr(registry_module, "_all_entry_points", registry_module._all_entry_points.__wrapped__)
     assert parse_config(AugmentConfig, ["--perturbation.azimuth_deg", "3"], {}, command="a").perturbation == Orbit(
         azimuth_deg=3.0
     )
