@@ -22,6 +22,7 @@ from lerobot_msdyn.augment.workers import workers_for
 from lerobot_msdyn.core import plugins
 from lerobot_msdyn.core.cli import EXIT_INTERRUPTED, parse_config
 from lerobot_msdyn.core.errors import OutputError
+from lerobot_msdyn.core.perturbation import PERTURBATIONS
 from lerobot_msdyn.core.registries import DEPTH
 from lerobot_msdyn.dataset.read import open_source
 from lerobot_msdyn.dataset.write import OutputDataset
@@ -97,11 +98,12 @@ class FarWall(DepthProvider):
 
 @pytest.fixture
 def plugin(tmp_path: Path) -> Iterator[Path]:
-    """A depth provider of a user's own, in a file named like one of Python's modules."""
+    """A provider of a user's own, or what a test writes there, in a file named like one of Python's modules."""
     path = tmp_path / "random.py"
     path.write_text(PLUGIN.replace("METRES", "1.5"))
     yield path
     DEPTH._registered.pop("far_wall", None)
+    PERTURBATIONS._registered.pop("shove", None)
     plugins._imported.pop(str(path), None)
 
 
@@ -122,8 +124,8 @@ def test_workers_use_a_plugin_of_the_run(desk: Path, tmp_path: Path, plugin: Pat
 def test_settings_reach_a_worker_as_plain_values(desk: Path, tmp_path: Path, plugin: Path) -> None:
     """They may be of a plugin's types, which cannot be read before the plugin is imported."""
     plugin.write_text(
-        "from dataclasses import dataclass\nfrom lerobot_msdyn.core.config import PerturbationConfig\n"
-        "@PerturbationConfig.register_subclass('shove')\n@dataclass\nclass Shove(PerturbationConfig):\n"
+        "from dataclasses import dataclass\nfrom lerobot_msdyn.core.perturbation import Perturbation\n"
+        "@Perturbation.register_subclass('shove')\n@dataclass\nclass Shove(Perturbation):\n"
         "    metres: float = 0.5\n"
     )
     flags = command(desk, tmp_path / "new", "--plugins", str(plugin), "--perturbation.type", "shove")
