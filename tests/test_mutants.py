@@ -40,7 +40,7 @@ SHOWN = list(range(1, FRAMES, 3))  # frames that are compared
 # What must be reached. Measured: 26.6 and 20.3 dB, 25.7 and 19.6 dB; the best mutant of motion 25.5, 19.3, 24.6, 17.3.
 LIMITS_DB = {"az+05": (26.0, 19.6), "el+08": (26.0, 19.6), "sampled camera": (25.1, 18.6)}  # PSNR, dynamic PSNR
 MEDIAN_M, MOST_M = 0.0045, 0.016  # error of points on what moves, half of them and nine of ten; measured: 2.7, 10.0 mm
-COVERED = 0.02  # share of the picture by which the covered part may be misjudged
+COVERED = 0.03  # share of the picture by which the covered part may be misjudged; measured: 0.019, a blind one 0.06
 GATE = GateConfig(min_expected_db=24.0)
 NEAR_DEG, FAR_DEG = 3.0, 45.0  # a view that the gate must keep, and one that it must reject
 
