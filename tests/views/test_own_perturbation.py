@@ -137,7 +137,9 @@ def test_installed_packages_bring_kinds_by_entry_points(tmp_path: Path, monkeypa
     assert "shaking" not in sys.modules, "imported only where it is named"
     flags = ["--perturbation.type", "shaking", "--perturbation.azimuth_deg", "3"]
     assert parse_config(AugmentConfig, flags, {}, command="a").perturbation.type_name == "shaking"
-    with pytest.raises(ConfigError, match=r"perturbation 'broken': absent:Kind cannot be imported \(ModuleNotFoundError: No module"):
+    with pytest.raises(
+        ConfigError, match=r"perturbation 'broken': absent:Kind cannot be imported \(ModuleNotFoundError: No module"
+    ):
         parse_config(AugmentConfig, ["--perturbation.type", "broken"], {}, command="a")
 
 
