@@ -15,7 +15,7 @@ import draccus
 import yaml
 from draccus.wrappers.docstring import get_attribute_docstring
 
-from lerobot_msdyn.core.config import Recipe
+from lerobot_msdyn.core.config import FORMER_FIELDS, Recipe
 from lerobot_msdyn.core.errors import ConfigError, MsdynError, one_line
 from lerobot_msdyn.core.fields import problems
 from lerobot_msdyn.core.plugins import import_plugins
@@ -183,6 +183,10 @@ def _unknown_fields(config_class: type, merged: dict[str, Any], part: dict[str, 
     lines = []
     for key, value in part.items():
         if key not in names:
+            former = FORMER_FIELDS.get(f"{prefix}{key}")
+            if former is not None:
+                lines.append(f"{prefix}{key} is a field no more: {former}")
+                continue
             near = difflib.get_close_matches(str(key), names, n=1)
             hint = f", did you mean {prefix + near[0]!r}?" if near else f"; expected one of {', '.join(names)}"
             lines.append(f"unknown field {prefix + str(key)!r}{hint}")

@@ -22,6 +22,11 @@ Fill = Literal["inpaint", "nearest", "none"]
 _LEVELS = ["object", "primitive", "grain"]
 # Motion levels of other systems, which are not the package's own -> the plugin that registers each.
 RIVAL_LEVELS = {"flat": "benchmarks/rivals/flat.py", "field": "benchmarks/rivals/field.py"}
+# Fields of earlier versions -> what to do instead; recipes that an output keeps name all fields.
+FORMER_FIELDS = {
+    "motion.flat_bases": f"leave it out, or for the flat model add --plugins {RIVAL_LEVELS['flat']} and set "
+    "motion.settings.flat.bases"
+}
 
 
 @dataclass
@@ -126,7 +131,7 @@ class MotionConfig:
     register: bool = True
     # By level: frames from one knot of its motion to the next; between them it is interpolated. Without: object 1,
     # primitive 2, grain 4, particle 4.
-    frames_per_knot: dict[str, int] = numbers_of({}, 1, 1000, registry=MOTION_LEVELS)  # it is a field
+    frames_per_knot: dict[str, int] = numbers_of({}, 1, 1000, registry=MOTION_LEVELS)
     # By level: the settings of levels of your own.
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
 

@@ -76,6 +76,7 @@ def test_another_perturbation_type_drops_the_fields_of_the_old_one() -> None:
         (["--motion.levels", "[object,grain]"], r"motion.levels is \[object, grain\]; expected"),
         (["--motion.levels", "[flat,object]"], "motion.levels is"),
         (["--motion.levels", "[objects]"], "motion.levels.*objects"),
+        (["--motion.flat_bases", "10"], "motion.flat_bases is a field no more: leave it out, or .*settings.flat.bases"),
         (["--cameras", "front"], "cameras.*front.*list"),
         (["--repo", "[1]"], r"'repo_id' is \[1\]; expected text"),
         (["--include_source", "maybe"], "include_source.*maybe.*bool"),
