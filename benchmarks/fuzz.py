@@ -44,13 +44,11 @@ SCRATCH = Path(tempfile.mkdtemp(prefix="msdyn_fuzz_"))
 os.environ["HF_HOME"] = str(SCRATCH / "hf")
 os.environ["LEROBOT_MSDYN_CACHE"] = str(SCRATCH / "cache")
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from faults import KEYS, KINDS, Fault, base_of, record
+from faults import KINDS, Fault, base_of, record
+from judge import unfit_for_training, wrong_pictures
 from lerobot.datasets import LeRobotDataset
-from lerobot.utils.feature_utils import dataset_to_policy_features
-from marks import CAMERAS, read_turned, turns_of
 
 from lerobot_msdyn.augment import __main__ as augment
 from lerobot_msdyn.augment import run as job
@@ -304,66 +302,10 @@ def trial(place: Path, limit_s: int, fault: Fault) -> tuple[int | None, list[str
             dataset = LeRobotDataset("local/out", root=out, video_backend="pyav")
             assert len(dataset[i]) > 0 if (i := len(dataset) - 1) else True
             if fault.shown:
-                faults += wrong_pictures(dataset, source, fault) + unfit_for_training(dataset)
+                faults += wrong_pictures(dataset, source, fault.shown, whole=fault.whole) + unfit_for_training(dataset)
         except Exception as error:
             faults.append(f"the output cannot be opened: {type(error).__name__} {error}")
     return code, faults, text
-
-
-def wrong_pictures(dataset: LeRobotDataset, source: Path, fault: Fault) -> list[str]:
-    """What pictures of the output are not those of their rows."""
-    variants = pq.read_table(dataset.root / "meta" / "msdyn" / "episodes.parquet")["variant"].to_pylist()
-    found: collections.Counter[str] = collections.Counter()
-    first: dict[str, str] = {}
-
-    def count(kind: str, example: str) -> None:
-        found[kind] += 1
-        first.setdefault(kind, example)
-
-    for i in range(len(dataset)):
-        item = dataset[i]
-        number, row = int(item["episode_index"]), int(item["frame_index"])
-        episode, t = (int(value) for value in item["observation.state"][:2])
-        copy = variants[number] < 0
-        where = f"episode {number} ({'copy' if copy else 'new'} of {episode}) row {row}"
-        if t != row:
-            count("rows out of order", f"{where} has state {t}")
-        for camera, key in enumerate(KEYS):
-            shown = fault.shown[camera, episode][t]
-            if not shown:
-                continue
-            image = np.rint(item[key].permute(1, 2, 0).numpy() * 255).astype(np.uint8)
-            rendered = camera == 0 and not copy
-            upright = image[::-1] if rendered and not fault.whole else image
-            mark, turns = read_turned(upright)
-            place = dataset.meta.get_video_file_path(number, key)
-            recorded = turns_of_source(source, key, episode)
-            if mark is None:
-                if not (rendered and fault.whole):
-                    count("unreadable", f"{where} {CAMERAS[camera]}")
-            elif mark not in shown:
-                count("wrong picture", f"{where} {CAMERAS[camera]} shows {mark}, expected {sorted(shown)}")
-            elif (turns_of(dataset.root / place) - turns) % 4 != recorded:
-                count("turned", f"{where} {CAMERAS[camera]} is turned by {turns}, recorded {recorded}")
-    return [f"{total} x {kind}: {first[kind]}" for kind, total in found.items()]
-
-
-def turns_of_source(source: Path, key: str, episode: int) -> int:
-    """The quarter turns that the matrix of an episode's recorded video asks for."""
-    table = pq.read_table(next((source / "meta" / "episodes").rglob("*.parquet")))
-    number = table[f"videos/{key}/file_index"].to_pylist()[episode]
-    return turns_of(source / "videos" / key / "chunk-000" / f"file-{number:03d}.mp4")
-
-
-def unfit_for_training(dataset: LeRobotDataset) -> list[str]:
-    """What a trainer would fail at."""
-    try:
-        features = dataset_to_policy_features(dataset.meta.features)
-    except (TypeError, ValueError, KeyError) as error:
-        return [f"a trainer fails at the features: {type(error).__name__} {error}"]
-    stats = dataset.meta.stats or {}
-    lacking = [key for key in features if not {"mean", "std", "min", "max"} <= set(stats.get(key, {}))]
-    return [f"a trainer lacks the statistics of {lacking}"] if lacking else []
 
 
 def batch(cases: list[tuple[int, str]], options: argparse.Namespace, send: Connection) -> None:

@@ -73,9 +73,12 @@ def read_turned(image: np.ndarray) -> tuple[Mark | None, int]:
 
 
 def turns_of(path: Path) -> int:
-    """The quarter turns to the left that a video's display matrix asks for."""
-    with av.open(str(path)) as container:
-        return round(next(container.decode(video=0)).rotation / 90) % 4
+    """The quarter turns to the left that a video's display matrix asks for; none where it cannot be read."""
+    try:
+        with av.open(str(path)) as container:
+            return round(next(container.decode(video=0)).rotation / 90) % 4
+    except (av.FFmpegError, StopIteration, IndexError):
+        return 0
 
 
 def _bits(mark: Mark) -> list[bool]:
