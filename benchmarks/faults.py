@@ -21,6 +21,8 @@ from lerobot.configs import DepthEncoderConfig, RGBEncoderConfig
 from lerobot.datasets import LeRobotDataset
 from marks import CAMERAS, HEIGHT, WIDTH, Mark, picture
 
+from lerobot_msdyn.dataset.video import quiet_av1
+
 LENGTHS = (10, 12, 9, 11)
 FPS = 30
 ANY: frozenset[Mark] = frozenset()
@@ -84,7 +86,8 @@ def record(root: Path, codec: str = "h264", *, depth: bool = False) -> None:
             if depth:
                 frame[f"{KEYS[0]}_depth"] = np.full((HEIGHT, WIDTH, 1), 600, np.uint16)
             dataset.add_frame(frame)
-        dataset.save_episode(parallel_encoding=False)
+        with quiet_av1():
+            dataset.save_episode(parallel_encoding=False)
     dataset.finalize()
 
 
@@ -103,7 +106,7 @@ def encode(path: Path, pictures: Iterable[np.ndarray], how: Encoding, times: Seq
     """A video file; `times` are the frames' numbers, where some are left out."""
     path.parent.mkdir(parents=True, exist_ok=True)
     container_options = {} if how.timescale is None else {"video_track_timescale": str(how.timescale)}
-    with av.open(str(path), "w", options=container_options) as container:
+    with av.open(str(path), "w", options=container_options) as container, quiet_av1():
         stream = container.add_stream(how.codec, FPS, options=how.options)
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, how.pix_fmt
         if how.full_range:

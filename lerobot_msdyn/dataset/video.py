@@ -40,7 +40,28 @@ def quiet_encoders() -> None:
 
 @contextlib.contextmanager
 def quiet_av1() -> Iterator[None]:
-    """An AV1 encoder that is opened here says nothing but errors, unless the user has set SVT_LOG."""
+    """An AV1 encoder that is opened here says nothing but errors, unless the user has set SVT_LOG.
+
+    Nor does it, for root, leave this thread with a real-time priority, which would starve all others of the machine.
+    """
+    with _priority_kept(), _quiet_av1():
+        yield
+
+
+@contextlib.contextmanager
+def _priority_kept() -> Iterator[None]:
+    if not hasattr(os, "sched_getscheduler"):
+        yield
+        return
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, *before)
+
+
+@contextlib.contextmanager
+def _quiet_av1() -> Iterator[None]:
     if SVT_LOG in os.environ:
         yield
         return

@@ -1,5 +1,6 @@
 """Video files: frames in, the same number of frames out, cut without loss."""
 
+import os
 from fractions import Fraction
 from pathlib import Path
 
@@ -46,6 +47,13 @@ def test_encoded_frames_come_back(tmp_path: Path, encoder: RGBEncoderConfig) -> 
 
 
 @pytest.mark.parametrize(("start", "count"), [(0, 5), (5, 4), (9, 6)])
+@pytest.mark.skipif(not hasattr(os, "sched_getscheduler"), reason="asks the system for a process's priority")
+def test_encoding_leaves_the_priority_as_it_is(tmp_path: Path) -> None:
+    before = os.sched_getscheduler(0)
+    encode_video(frames(3), tmp_path / "a.mp4", RGBEncoderConfig(vcodec="libsvtav1"))
+    assert os.sched_getscheduler(0) == before
+
+
 def test_an_episode_is_cut_out_of_a_shared_file(
     tmp_path: Path, encoder: RGBEncoderConfig, start: int, count: int
 ) -> None:
