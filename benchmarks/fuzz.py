@@ -56,6 +56,7 @@ from lerobot_msdyn.core.cli import run_command
 from lerobot_msdyn.dataset.provenance import Provenance, camera_pose
 from lerobot_msdyn.dataset.read import read_episode
 from lerobot_msdyn.dataset.write import NewEpisode
+from lerobot_msdyn.reconstruction.account import Account, MovingPixels
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.dataset import write_dataset
 
@@ -86,7 +87,8 @@ def fake_episode(source: Any, index: int, cameras: list[str], recipe: Any, outpu
     views = {key: view.rgb.flip(1).numpy() for key, view in episode.views.items()}
     frames = [{key: rgb[t] for key, rgb in views.items()} for t in range(len(episode))]
     poses = {key: camera_pose(view.camera, view.camera) for key, view in episode.views.items()}
-    gate = {"views": {key: {"distance_m": 1.0} for key in views}, "rejected": []}
+    nothing = Account(MovingPixels(), 0.0, 0.0, held_out=False).entry()
+    gate = {"views": {key: {"distance_m": 1.0, "what_moves": nothing} for key in views}, "rejected": []}
     origin = Provenance(source.repo_id, index, 0, 0, {key: {"yaw_deg": 0.0} for key in views}, {}, poses, gate)
     new = replace(output.stage(index, 0, iter(frames), origin), seconds={"judging": 0.0})
     return [NewEpisode(index, Provenance(source.repo_id, index, -1, 0)), new]
@@ -266,7 +268,8 @@ def command(place: Path, limit_s: int, fault: Fault, *, interrupt_s: float = 0.0
         faults.append(f"exit code {code}")
     text = said.getvalue()
     if "Traceback" in text or "please report" in text:
-        faults.append("traceback")
+        rest = text[max(text.find("Traceback"), 0) :].splitlines()
+        faults.append("traceback: " + next((line for line in rest[1:] if line[:1].isalpha()), rest[0])[:200])
     if code == 2 and text.count("error: ") != 1:
         faults.append("not one line")
     return code, faults, text

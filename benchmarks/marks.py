@@ -8,10 +8,10 @@ import numpy as np
 
 CAMERAS = ("front", "side")
 WIDTH, HEIGHT = 64, 48
-CELL = 6  # px
+CELL = 5  # px
 BITS = (1, 2, 4)  # of the camera, the episode and the frame
-COLUMNS = sum(BITS)
-PLACE = (10, 8)  # x, y of the mark where the camera stands still
+COLUMNS = 2 + sum(BITS)  # the first is always light above, the last below
+PLACE = (9, 8)  # x, y of the mark where the camera stands still
 SEARCH = 12  # px around it
 CONTRAST = 40.0  # of 255, below which a bit cannot be read
 DARK, LIGHT = 10, 245
@@ -39,24 +39,22 @@ def picture(mark: Mark, shift: tuple[int, int] = (0, 0)) -> np.ndarray:
 
 def read_mark(image: np.ndarray) -> Mark | None:
     """What a picture uint8 [h,w,3] says; None where it cannot be read."""
-    grey = image.astype(np.float32).mean(2)
-    total = np.pad(grey, ((1, 0), (1, 0))).cumsum(0).cumsum(1)
-    best, found = CONTRAST, None
     inner = CELL - 2
-    for y in range(max(0, PLACE[1] - SEARCH), min(grey.shape[0] - 2 * CELL, PLACE[1] + SEARCH) + 1):
-        for x in range(max(0, PLACE[0] - SEARCH), min(grey.shape[1] - COLUMNS * CELL, PLACE[0] + SEARCH) + 1):
-            left = x + 1 + CELL * np.arange(COLUMNS)
-            means = []
-            for top in (y + 1, y + CELL + 1):
-                sums = total[top + inner, left + inner] - total[top, left + inner] - total[top + inner, left]
-                means.append((sums + total[top, left]) / inner**2)
-            difference = means[0] - means[1]
-            contrast = float(np.abs(difference).min())
-            if contrast > best:
-                best, found = contrast, [bool(value > 0) for value in difference]
-    if found is None:
+    means = cv2.blur(image.astype(np.float32).mean(2), (inner, inner), anchor=(0, 0))
+    ys = np.arange(max(0, PLACE[1] - SEARCH), min(len(means) - 2 * CELL, PLACE[1] + SEARCH) + 1)
+    xs = np.arange(max(0, PLACE[0] - SEARCH), min(means.shape[1] - COLUMNS * CELL, PLACE[0] + SEARCH) + 1)
+    columns = xs + 1 + CELL * np.arange(COLUMNS)[:, None]
+    upper = means[ys[:, None, None] + 1, columns]  # [y, column, x]
+    lower = means[ys[:, None, None] + 1 + CELL, columns]
+    difference, middle = upper - lower, (upper + lower) / 2
+    contrast = np.abs(difference).min(1)
+    # One half of a pair alone would do without this.
+    contrast[middle.max(1) - middle.min(1) > contrast / 2] = 0
+    y, x = np.unravel_index(contrast.argmax(), contrast.shape)
+    found = [bool(value) for value in difference[y, :, x] > 0]
+    if contrast[y, x] < CONTRAST or not found[0] or found[-1]:
         return None
-    values, start = [], 0
+    values, start = [], 1
     for bits in BITS:
         values.append(sum(int(bit) << i for i, bit in enumerate(found[start : start + bits])))
         start += bits
@@ -82,4 +80,5 @@ def turns_of(path: Path) -> int:
 
 
 def _bits(mark: Mark) -> list[bool]:
-    return [bool(value >> i & 1) for value, bits in zip(mark, BITS, strict=True) for i in range(bits)]
+    bits = [bool(value >> i & 1) for value, count in zip(mark, BITS, strict=True) for i in range(count)]
+    return [True, *bits, False]

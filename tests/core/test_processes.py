@@ -28,8 +28,11 @@ if __name__ == "__main__":
 
 
 def test_results_come_in_order_and_what_is_said_comes_too(caplog: pytest.LogCaptureFixture) -> None:
-    said: list[object] = []
-    with caplog.at_level("INFO"), Processes(2, tasks.begin, lambda *told: said.append(told)) as workers:
+    said: list[tuple[str, int]] = []
+    with (
+        caplog.at_level("INFO"),
+        Processes(2, tasks.begin, lambda what, number: said.append((what, number))) as workers,
+    ):
         assert list(workers.map(tasks.double, range(8))) == list(range(0, 16, 2))
         assert list(workers.map(tasks.double, [])) == []
         assert list(workers.map(tasks.double, [5])) == [10]

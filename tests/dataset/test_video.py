@@ -46,7 +46,6 @@ def test_encoded_frames_come_back(tmp_path: Path, encoder: RGBEncoderConfig) -> 
     assert (shades - torch.arange(7) * 10).abs().max() < 4
 
 
-@pytest.mark.parametrize(("start", "count"), [(0, 5), (5, 4), (9, 6)])
 @pytest.mark.skipif(not hasattr(os, "sched_getscheduler"), reason="asks the system for a process's priority")
 def test_encoding_leaves_the_priority_as_it_is(tmp_path: Path) -> None:
     before = os.sched_getscheduler(0)
@@ -54,6 +53,7 @@ def test_encoding_leaves_the_priority_as_it_is(tmp_path: Path) -> None:
     assert os.sched_getscheduler(0) == before
 
 
+@pytest.mark.parametrize(("start", "count"), [(0, 5), (5, 4), (9, 6)])
 def test_an_episode_is_cut_out_of_a_shared_file(
     tmp_path: Path, encoder: RGBEncoderConfig, start: int, count: int
 ) -> None:
