@@ -93,11 +93,11 @@ def record(root: Path, codec: str = "h264", *, depth: bool = False) -> None:
 
 @dataclass
 class Encoding:
-    """How a video file is written."""
+    """How a video file is written; every frame is a key frame unless the options say otherwise."""
 
     codec: str = H264
     pix_fmt: str = "yuv420p"
-    options: dict[str, str] = field(default_factory=lambda: {"crf": "20", "g": "2"})
+    options: dict[str, str] = field(default_factory=lambda: {"crf": "20", "g": "1"})
     full_range: bool = False
     timescale: int | None = None
 
@@ -226,10 +226,10 @@ def mixed_codecs(root: Path, rng: random.Random) -> Fault:
     """Files of one camera in several codecs, pixel formats, key frame distances or time bases."""
     ways = [
         Encoding(),
-        Encoding(AV1, options={"crf": "30", "preset": "12", "g": "2", "svtav1-params": "lp=1"}),
-        Encoding(HEVC, options={"crf": "20", "x265-params": "log-level=error:pools=1"}),
+        Encoding(AV1, options={"crf": "30", "preset": "12", "g": "1", "svtav1-params": "lp=1"}),
+        Encoding(HEVC, options={"crf": "20", "g": "1", "x265-params": "log-level=error:pools=1"}),
         Encoding(pix_fmt="yuv444p"),
-        Encoding("mpeg4", options={"q:v": "3"}),
+        Encoding("mpeg4", options={"q:v": "3", "g": "1"}),
         Encoding(timescale=rng.choice([90000, 15360, 600])),
         Encoding(options={"crf": "20", "g": "50", "bf": "3"}),
         Encoding(full_range=True),

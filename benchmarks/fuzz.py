@@ -21,6 +21,7 @@ import argparse
 import collections
 import contextlib
 import faulthandler
+import gc
 import io
 import json
 import logging
@@ -288,6 +289,7 @@ def interrupted(place: Path, limit_s: int, fault: Fault) -> list[str]:
 
 def trial(place: Path, limit_s: int, fault: Fault) -> tuple[int | None, list[str], str]:
     """The command on the broken copy in `place`, and all that it must not have done."""
+    gc.collect()  # what the run before has left open complains when it goes
     source, out = place / "ds", place / "out"
     before, here = listing(source), set(listing(Path.cwd()))
     early = interrupted(place, limit_s, fault) if fault.interrupt_s else []
