@@ -50,19 +50,20 @@ def run(arguments: list[str]) -> int:
     opened = None if config.convert else _open(config, config.root)
     if opened is not None and config.dry_run:
         return _say_plan(config, *opened, new_root)
-    with Staging(new_root) as staging:
-        try:
+    staging = Staging(new_root)
+    try:
+        with staging:
             if opened is None:
                 opened = _convert(config, root, staging)
                 if config.dry_run:
                     return _say_plan(config, *opened, new_root)
             return augment(config, *opened, new_repo_id, new_root, staging)
-        except KeyboardInterrupt:
-            sys.stderr.write(
-                f"interrupted: {staging.finished()} episodes are finished and kept in {staging.folder}; "
-                "the same command goes on from there\n"
-            )
-            return EXIT_INTERRUPTED
+    except KeyboardInterrupt:
+        kept = staging.kept()
+        if kept:
+            kept = f"kept in {staging.folder}: {kept}; the same command goes on from there"
+        sys.stderr.write(f"interrupted: {kept or 'nothing was finished yet, and nothing is kept'}\n")
+        return EXIT_INTERRUPTED
 
 
 def _open(config: AugmentConfig, root: Path | None) -> tuple["LeRobotDatasetMetadata", list[int], list[str]]:

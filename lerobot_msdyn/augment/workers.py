@@ -1,25 +1,17 @@
 """Processes that work on episodes beside each other, each on its share of the cores.
 
-A worker writes to the work folder that its parent has locked, and ends with its parent, however that ends: it listens
-at a pipe whose other end nobody else holds.
+A worker writes to the work folder that its parent has locked, and ends with its parent, however that ends.
 """
 
 import contextlib
 import functools
 import logging
-import logging.handlers
 import math
-import multiprocessing
 import os
-import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from multiprocessing.connection import Connection
-from multiprocessing.queues import Queue
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +24,10 @@ from tqdm import tqdm
 from lerobot_msdyn.augment.backgrounds import Backgrounds, MaskTask, Run, shared_backgrounds
 from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.augment.episode import Progress
-from lerobot_msdyn.core.errors import WorkerError
 from lerobot_msdyn.core.plugins import import_plugins, imported_plugins
+from lerobot_msdyn.core.processes import Processes
 from lerobot_msdyn.dataset.read import open_source
-from lerobot_msdyn.dataset.staging import Staging
+from lerobot_msdyn.dataset.staging import BACKGROUNDS, Staging
 from lerobot_msdyn.dataset.video import quiet_encoders
 from lerobot_msdyn.dataset.write import OutputDataset
 from lerobot_msdyn.render.devices import chosen_device
@@ -63,7 +55,7 @@ class Work:
         def make() -> Backgrounds:
             return shared_backgrounds(self.source, self.cameras, self.config, self.run)
 
-        backgrounds: Backgrounds = self.output.staging.keep("backgrounds", make)
+        backgrounds: Backgrounds = self.output.staging.keep(BACKGROUNDS, make)
         return backgrounds
 
 
@@ -133,75 +125,21 @@ def _room_on_gpu(config: AugmentConfig) -> float:
     return torch.cuda.mem_get_info()[0] // GPU_MEMORY_EACH
 
 
-class Workers:
-    """Some processes, started when they are first needed. Use as a context."""
+class Workers(Processes[Work]):
+    """Processes that work on episodes. Use as a context."""
 
     def __init__(self, count: int, work: Work) -> None:
-        self.count = count
-        context = multiprocessing.get_context("spawn")
-        theirs, self._ours = context.Pipe(duplex=False)
-        self._messages: Queue = context.Queue()
-        self._listener = threading.Thread(target=_listen, args=(self._messages, work.progress), daemon=True)
-        threads = _share_of_threads(count)
-        self._pool = ProcessPoolExecutor(count, context, _begin, (_place_of(work), threads, theirs, self._messages))
-
-    def __enter__(self) -> "Workers":
-        self._listener.start()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is not None:
-            self._ours.close()  # they end at once
-        self._pool.shutdown(wait=True, cancel_futures=True)
-        self._ours.close()
-        self._messages.put(None)
-        self._listener.join()
-        self._messages.close()
-
-    def map[A, B](self, function: Callable[[Work, A], B], items: Iterable[A]) -> Iterator[B]:
-        """What a function of a module makes of each item, in their order.
-
-        Raises:
-            WorkerError: a worker ended; what is finished is kept.
-        """
-        try:
-            with _interrupts_held():  # also in the processes that are started here
-                results = self._pool.map(functools.partial(_call, function), items)
-            yield from results
-        except BrokenProcessPool as error:
-            raise WorkerError(
-                f"one of {self.count} worker processes ended unexpectedly, most often for want of memory; what is "
-                "finished is kept: the same command with --workers 1 goes on from there"
-            ) from error
+        super().__init__(count, functools.partial(_begin, _place_of(work), _share_of_threads(count)), work.progress)
 
     def moving(
         self, function: Callable[[LeRobotDatasetMetadata, MaskTask], object], tasks: list[MaskTask]
     ) -> Iterator[object]:
-        """The same for a function of the source."""
+        """The same as `map` for a function of the source."""
         return self.map(_with_source, [(function, task) for task in tasks])
 
 
-@contextlib.contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Ctrl-C reaches all processes of a terminal, but is the parent's to answer, once this is left."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-_here: list[Work] = []  # that of this worker
-
-
-def _begin(place: _Place, threads: int, parent: Connection, messages: Queue) -> None:
+def _begin(place: _Place, threads: int, progress: Progress) -> Work:
     """Make a new process a worker."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-    logging.basicConfig(level=logging.INFO, handlers=[logging.handlers.QueueHandler(messages)], force=True)
     logging.getLogger(chosen_device.__module__).setLevel(logging.ERROR)  # its parent has said what is used
     tqdm.set_lock(threading.RLock())  # its own is for several processes, and left behind by one that ends at once
     torch.set_num_threads(threads)
@@ -210,28 +148,9 @@ def _begin(place: _Place, threads: int, parent: Connection, messages: Queue) -> 
     config, source = _config_at(place), open_source(place.repo_id, place.root)
     staging = Staging(place.new_root, lock=False)
     output = OutputDataset(source, place.new_repo_id, place.new_root, staging, nvenc=config.nvenc)
-    _here.append(Work(source, place.cameras, config, output, lambda what, share: messages.put((what, share))))
-
-
-def _end_with(parent: Connection) -> None:
-    with contextlib.suppress(EOFError, OSError):
-        parent.recv()
-    os._exit(1)
-
-
-def _call[A, B](function: Callable[[Work, A], B], item: A) -> B:
-    return function(_here[0], item)
+    return Work(source, place.cameras, config, output, progress)
 
 
 def _with_source(work: Work, call: tuple[Callable[[LeRobotDatasetMetadata, MaskTask], object], MaskTask]) -> object:
     function, task = call
     return function(work.source, task)
-
-
-def _listen(messages: Queue, progress: Progress) -> None:
-    """Log here what workers log, and report their progress, until there is nothing more to come."""
-    while (message := messages.get()) is not None:
-        if isinstance(message, logging.LogRecord):
-            logging.getLogger(message.name).handle(message)
-        else:
-            progress(*message)

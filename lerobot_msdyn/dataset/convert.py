@@ -11,6 +11,7 @@ from lerobot.scripts.convert_dataset_v21_to_v30 import convert_dataset
 from lerobot_msdyn.core.errors import DatasetError, first_line
 from lerobot_msdyn.core.files import temporary_files_in, writing
 from lerobot_msdyn.dataset.checks import check_features, read_json, regular_file
+from lerobot_msdyn.dataset.staging import CONVERTED
 
 logger = logging.getLogger(__name__)
 
@@ -24,7 +25,7 @@ def converted_copy(repo_id: str, root: Path, folder: Path) -> Path:
         DatasetError: it is not of version v2.1, names files outside of itself, or LeRobot cannot convert it.
         OutputError: the work folder cannot be written.
     """
-    done = folder / "converted"
+    done = folder / CONVERTED
     if done.exists():
         return done
     info = read_json(root, "meta/info.json")

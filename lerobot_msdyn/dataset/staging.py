@@ -28,7 +28,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from lerobot_msdyn.core.errors import OutputError
+from lerobot_msdyn.core.errors import OutputError, WorkerError
 from lerobot_msdyn.core.files import write_whole, writing
 from lerobot_msdyn.core.serialise import ValueFileError, load_value, save_value
 
@@ -37,7 +37,10 @@ logger = logging.getLogger(__name__)
 FINISHED = "finished"
 SCENE = "scene"
 PUBLISHED = "published.json"
-WORTH_KEEPING = (SCENE, "variant", FINISHED)  # what takes long to make
+BACKGROUNDS = "backgrounds"
+CONVERTED = "converted"
+WORTH_KEEPING = (SCENE, "variant", FINISHED)  # what takes long to make of an episode
+STOPPED = (KeyboardInterrupt, OutputError, WorkerError)  # ends of a run that the same command can go on from
 MAX_NAMED = 5  # differences that a message lists
 CODE_CHANGED = "the code of lerobot_msdyn has changed"
 FILES = ("source", "files", "plugins")  # parts of the description whose values are digests of files
@@ -121,15 +124,35 @@ class Staging(Kept):
     def __enter__(self) -> "Staging":
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self.close(stopped=kind is not None and issubclass(kind, STOPPED))
 
-    def close(self) -> None:
-        """Unlock the folder; it goes if nothing in it is worth keeping."""
-        episodes = self.folder / "episodes"
-        if not any(path for name in WORTH_KEEPING for path in episodes.glob(f"*/{name}*.safetensors")):
+    def close(self, *, stopped: bool = False) -> None:
+        """Unlock the folder; it goes if nothing in it is worth keeping.
+
+        Args:
+            stopped: whether the run may go on, so that what its episodes share is worth keeping as well.
+        """
+        if not (self._episodes(*WORTH_KEEPING) or (stopped and self._shared())):
             self.remove()
         self._lock.release()
+
+    def kept(self) -> str:
+        """What is there for a run that goes on, in words; empty if nothing is."""
+        finished, begun = self._episodes(FINISHED), self._episodes(*WORTH_KEEPING)
+        parts = [f"{len(finished)} finished episodes"] if finished else []
+        parts += [f"parts of {len(begun - finished)} more"] if begun - finished else []
+        return ", ".join([*parts, *self._shared()])
+
+    def _episodes(self, *names: str) -> set[str]:
+        """The folders of episodes of which some of these values are kept."""
+        folder = self.folder / "episodes"
+        return {path.parent.name for name in names for path in folder.glob(f"*/{name}*.safetensors")}
+
+    def _shared(self) -> list[str]:
+        """What is kept of what all episodes share."""
+        parts = ["the converted copy"] if (self.folder / CONVERTED).exists() else []
+        return parts + (["the shared background"] if self.has(BACKGROUNDS) else [])
 
     def episode(self, index: int) -> Kept:
         """What is kept of one source episode."""
@@ -137,7 +160,7 @@ class Staging(Kept):
 
     def finished(self) -> int:
         """How many episodes are finished."""
-        return sum(1 for _ in (self.folder / "episodes").glob(f"*/{FINISHED}.safetensors"))
+        return len(self._episodes(FINISHED))
 
     def agree(self, run: dict[str, Any], *, restart: bool = False) -> None:
         """Go on with what is here if it is the same run, else begin anew where nothing is, or on request.

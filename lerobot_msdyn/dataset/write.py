@@ -84,9 +84,9 @@ class OutputDataset:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if not self._resumable:
+        if not self._resumable:  # else the staging's owner closes it
             self.staging.remove()
-        self.staging.close()
+            self.staging.close()
 
     def episode(self, index: int) -> Kept:
         """What is kept of one source episode: `keep` computes a value once, whatever number of runs it takes."""

@@ -15,6 +15,9 @@ import torch
 from augment_command import FAST, FRONT, SIDE, run
 from lerobot.datasets import LeRobotDataset
 
+from lerobot_msdyn.augment import run as job
+from lerobot_msdyn.augment import workers
+
 
 @pytest.fixture(scope="module")
 def augmented(desk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -157,8 +160,6 @@ def half_broken_desk(desk: Path, tmp_path: Path) -> Path:
 def test_a_fault_in_one_episode_does_not_cost_the_others(
     desk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from lerobot_msdyn.augment import run as job
-
     whole = job.augment_episode
 
     def faulty(source: Any, index: int, *rest: Any) -> object:
@@ -181,8 +182,6 @@ def content(root: Path) -> dict[Path, bytes]:
 def test_a_run_that_was_stopped_goes_on_and_gives_the_same_files(
     desk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from lerobot_msdyn.augment import run as job
-
     whole = job.augment_episode
     begun: list[int] = []
 
@@ -196,7 +195,8 @@ def test_a_run_that_was_stopped_goes_on_and_gives_the_same_files(
     arguments += ["--variants", "1", *FAST, "--new_repo_id", "local/new"]
     monkeypatch.setattr(job, "augment_episode", stopped)
     assert run(*arguments, "--new_root", str(tmp_path / "new")) == 130
-    assert "interrupted: 1 episodes are finished and kept in" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert f"interrupted: kept in {tmp_path / '.new.partial'}: 1 finished episodes, the shared background; the" in said
     assert not (tmp_path / "new").exists()
     assert run(*arguments, "--new_root", str(tmp_path / "new"), "--fit.steps", "9") == 2
     assert "started differently: fit.steps was 8, is 9. Start it as before" in capsys.readouterr().err
@@ -214,6 +214,30 @@ def test_a_run_that_was_stopped_goes_on_and_gives_the_same_files(
     assert first == second
     assert sorted(path.name for path in tmp_path.iterdir()) == ["new", "whole"]
     assert begun == [0]
+
+
+@pytest.mark.parametrize("moment", ["background", "episode"])
+def test_an_interrupted_run_keeps_what_it_says(
+    desk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, moment: str
+) -> None:
+    def stopped(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    where, what = (workers, "shared_backgrounds") if moment == "background" else (job, "augment_episode")
+    monkeypatch.setattr(where, what, stopped)
+    arguments = ["--repo", "local/desk", "--root", str(desk), "--new_root", str(tmp_path / "new")]
+    arguments += ["--cameras", "[front]", "--variants", "1", "--workers", "1", *FAST]
+    assert run(*arguments) == 130
+    said, kept = capsys.readouterr().err.splitlines()[-1], tmp_path / ".new.partial" / "backgrounds.safetensors"
+    if moment == "background":
+        assert said == "interrupted: nothing was finished yet, and nothing is kept"
+        assert list(tmp_path.iterdir()) == []
+        return
+    folder = kept.parent
+    assert said == f"interrupted: kept in {folder}: the shared background; the same command goes on from there"
+    before = kept.stat().st_mtime_ns
+    assert run(*arguments) == 130
+    assert kept.stat().st_mtime_ns == before
 
 
 def test_states_that_are_no_numbers_cost_their_episode_only(
