@@ -48,11 +48,12 @@ def converted_copy(repo_id: str, root: Path, folder: Path) -> Path:
         with temporary_files_in(folder), _lerobot_quiet():
             # A file per episode: the script puts videos together whatever their codecs, and by the lengths they claim.
             convert_dataset(repo_id, root=copy, push_to_hub=False, video_file_size_in_mb=ONE_EACH_MB)
-        new = read_json(copy, "meta/info.json")
-        new |= {"fps": info.get("fps"), "video_files_size_in_mb": DEFAULT_VIDEO_FILE_SIZE_IN_MB}  # it rounds fps
-        write_whole(copy / "meta" / "info.json", json.dumps(new, indent=4).encode())
     except Exception as error:  # several libraries read the files, each with errors of its own
         raise DatasetError(f"{root} cannot be converted by LeRobot's script ({first_line(error)})") from error
+    new = read_json(copy, "meta/info.json")
+    new |= {"fps": info.get("fps"), "video_files_size_in_mb": DEFAULT_VIDEO_FILE_SIZE_IN_MB}  # it rounds fps
+    with writing(folder):
+        write_whole(copy / "meta" / "info.json", json.dumps(new, indent=4).encode())
     copy.rename(done)
     shutil.rmtree(copy.parent)
     return done

@@ -173,8 +173,8 @@ def cut_video(
         OSError: the disk to write to is full.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    packets = _alone(video, numbers)
     try:
+        packets = _alone(video, numbers)
         if len(packets) == len(video.packets) > 0:
             shutil.copyfile(video.path, path)
         elif packets:

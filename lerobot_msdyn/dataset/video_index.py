@@ -178,8 +178,6 @@ def frame_numbers(
             f"{video.path} has {len(times)} video frames for {total} rows of its {len(placed)} episodes, and nothing "
             "says which of them lost frames; record them again, or leave them out with --episodes"
         )
-    if total < len(times):
-        _say_left_over(video.path, len(times) - total)
     first = int(np.searchsorted(times, me.start_s - half))
     after = min((one.start_s for one in placed if one.start_s > me.start_s), default=math.inf)
     bound = int(np.searchsorted(times, after - half))
@@ -190,6 +188,8 @@ def frame_numbers(
             f"frames for {total} rows: nothing says which are its own; correct from_timestamp in meta/episodes"
         )
     if rows in (bound - first, end - first):
+        if total < len(times):
+            _say_left_over(video.path, len(times) - total)
         return list(range(first, first + rows))
     return _by_times(video, times[first:end], first, me.start_s + row_times, fps, tolerance_s)
 
