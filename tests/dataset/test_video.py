@@ -11,8 +11,8 @@ from lerobot.datasets.video_utils import concatenate_video_files, decode_video_f
 
 from lerobot_msdyn.core.errors import EpisodeError, OutputError
 from lerobot_msdyn.dataset import video
-from lerobot_msdyn.dataset.video_index import index_of
 from lerobot_msdyn.dataset.video import VideoFile, cut_video, encoder_of, frame_times, nvenc_of
+from lerobot_msdyn.dataset.video_index import index_of
 
 FPS = 10
 
