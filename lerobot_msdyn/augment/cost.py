@@ -1,8 +1,10 @@
-"""How long a run will take, from a few frames and steps of its first episode."""
+"""How long a run will take, from a few frames and steps of its first episode that can be read."""
 
+import logging
 import statistics
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,6 +13,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot_msdyn.augment.backgrounds import looked_at
 from lerobot_msdyn.augment.episode import by_feature
 from lerobot_msdyn.core.config import Recipe
+from lerobot_msdyn.core.errors import EpisodeError
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.dataset.encode import stage_pictures
 from lerobot_msdyn.dataset.read import read_episode
@@ -18,6 +21,8 @@ from lerobot_msdyn.reconstruction.reconstruct import FURTHER_STEPS, reconstruct
 from lerobot_msdyn.render.devices import chosen_device
 from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.views.pictures import new_pictures, on_device
+
+logger = logging.getLogger(__name__)
 
 PROBE_FRAMES = 24
 PROBE_STEPS = 14
@@ -36,6 +41,23 @@ class Speeds:
     render_s: float  # per new frame, encoded
     scene_bytes: float = 0.0  # of the saved scenes of an episode, however long ...
     frame_bytes: float = 0.0  # ... and for each of its frames
+
+
+def first_speeds(source: LeRobotDatasetMetadata, episodes: Sequence[int], cameras: list[str], recipe: Recipe) -> Speeds:
+    """Those of the first of the episodes that can be read and reconstructed.
+
+    Raises:
+        EpisodeError: none of them can; the first one's reason.
+        PriorError: a prior was demanded and cannot be had.
+    """
+    first: EpisodeError | None = None
+    for index in episodes:
+        try:
+            return measure_speeds(source, index, cameras, recipe)
+        except EpisodeError as error:
+            logger.warning("not measured: %s", error)
+            first = first or error
+    raise first or EpisodeError(f"{source.repo_id}: no episode to measure")
 
 
 def measure_speeds(source: LeRobotDatasetMetadata, index: int, cameras: list[str], recipe: Recipe) -> Speeds:
