@@ -9,12 +9,17 @@ import av
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from lerobot.configs import RGBEncoderConfig
 from lerobot.datasets import LeRobotDataset
+
+from lerobot_msdyn.dataset.video import tamed_av1
 
 FRONT, SIDE = "observation.images.front", "observation.images.side"
 HEIGHT, WIDTH, FPS = 48, 64, 10
 BAR = WIDTH // 8
 DARK, BRIGHT = 30, 220
+
+av.logging.set_libav_level(av.logging.ERROR)
 
 
 def picture(code: int) -> np.ndarray:
@@ -29,18 +34,22 @@ def code_of(shown: Any) -> int:
     return int("".join(str(int(bar > (DARK + BRIGHT) / 2)) for bar in bars), 2)
 
 
-def record(root: Path, lengths: Sequence[int], cameras: Sequence[str] = (FRONT,), fps: int = FPS) -> list[list[int]]:
+def record(
+    root: Path, lengths: Sequence[int], cameras: Sequence[str] = (FRONT,), codec: str = "h264"
+) -> list[list[int]]:
     """A dataset of one video file per camera; returns the codes of its episodes."""
     features = {key: {"dtype": "video", "shape": (HEIGHT, WIDTH, 3), "names": None} for key in cameras}
     features |= {"action": {"dtype": "float32", "shape": (1,), "names": None}}
-    dataset = LeRobotDataset.create("local/bars", fps, features, root=root, use_videos=True, video_backend="pyav")
+    encoder = RGBEncoderConfig(vcodec=codec)
+    dataset = LeRobotDataset.create("local/bars", FPS, features, root=root, video_backend="pyav", rgb_encoder=encoder)
     codes = list(range(1, 1 + sum(lengths)))
     episodes = [[codes.pop(0) for _ in range(length)] for length in lengths]
     for episode in episodes:
         for code in episode:
             pictures = {key: picture(code) for key in cameras}
             dataset.add_frame(pictures | {"action": np.array([code], np.float32), "task": "show a number"})
-        dataset.save_episode(parallel_encoding=False)
+        with tamed_av1():
+            dataset.save_episode(parallel_encoding=False)
     dataset.finalize()
     return episodes
 
