@@ -197,7 +197,7 @@ def cut_video(
         if len(packets) == len(video.packets) > 0:
             shutil.copyfile(video.path, path)
         elif packets:
-            _copy_packets(video, packets, path)
+            _copy_packets(video, packets, fps, path)
         if not packets or frame_times(path) != [i / frame_rate(fps) for i in range(len(numbers))]:
             _encode_anew(video, numbers, fps, encoder(), path)
     except OutputError as error:
@@ -222,11 +222,15 @@ def _alone(video: VideoIndex, numbers: Sequence[int]) -> tuple[Packet, ...]:
 
 
 def frame_times(path: Path) -> list[Fraction]:
-    """Presentation times (s) of all frames of a video, in order, rounded to the nearest 1/1000 of a frame."""
+    """When a video shows its frames (s), in order, rounded to the nearest 1/1000 of a frame."""
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         rate = stream.average_rate or stream.base_rate
-        times = [packet.pts * stream.time_base for packet in container.demux(stream) if packet.pts is not None]
+        times = [
+            packet.pts * stream.time_base
+            for packet in container.demux(stream)
+            if packet.pts is not None and not packet.is_discard
+        ]
     return sorted(Fraction(round(time * rate * 1000), 1000) / rate for time in times)
 
 
@@ -262,8 +266,9 @@ def problem_of(
     return None if count == frames else f"it has {count} frames; expected {frames}"
 
 
-def _copy_packets(video: VideoIndex, packets: Sequence[Packet], path: Path) -> None:
+def _copy_packets(video: VideoIndex, packets: Sequence[Packet], fps: int | float, path: Path) -> None:
     first, wanted = packets[0], {packet.pts for packet in packets}
+    frame_ticks = round(1 / frame_rate(fps) / video.time_base)
     with av.open(str(video.path)) as reader, av.open(str(path), "w", options={"movflags": "faststart"}) as writer:
         stream = reader.streams.video[0]
         copy = writer.add_stream_from_template(template=stream, opaque=True)
@@ -275,6 +280,7 @@ def _copy_packets(video: VideoIndex, packets: Sequence[Packet], path: Path) -> N
             wanted.remove(packet.pts)
             packet.pts -= first.pts
             packet.dts -= first.pts
+            packet.duration = packet.duration or frame_ticks  # the last frame of a file is not shown without one
             packet.stream = copy
             writer.mux(packet)
             if not wanted:
