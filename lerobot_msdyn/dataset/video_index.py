@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import av
@@ -29,7 +29,7 @@ VIDEO_ERRORS = (av.FFmpegError, OSError, ValueError, RuntimeError, IndexError, A
 SURE = 0.25  # of a frame: a start that is nearer to a frame than this is that frame
 COVERED = 0.75  # of a frame: less than this may follow the last frame that rows name
 UPRIGHT = (1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30)  # a display matrix that changes nothing
-FILES_KEPT = 256
+FILES_KEPT = 32  # some MB each
 
 
 @dataclass(frozen=True)
@@ -53,12 +53,12 @@ class VideoIndex:
     complete: bool  # whether all frames are there that the file's header counts
     coding: tuple[object, ...]  # what files must have in common to be put together without encoding them again
 
-    @property
+    @cached_property
     def shown(self) -> list[int]:
         """When each frame is shown (ticks), in that order: a frame's place here is its number."""
         return sorted(packet.pts for packet in self.packets)
 
-    @property
+    @cached_property
     def times(self) -> np.ndarray:
         """The same in seconds, [n]."""
         return np.array(self.shown, np.float64) * float(self.time_base)
@@ -206,7 +206,7 @@ def _contradicted(times: np.ndarray, placed: Sequence[Placed], firsts: np.ndarra
 def _by_times(
     video: VideoIndex, times: np.ndarray, first: int, wanted: np.ndarray, fps: int | float, tolerance_s: float
 ) -> list[int]:
-    problem = f"{max(0, len(times))} video frames for {len(wanted)} rows in {video.path}"
+    problem = f"{len(times)} video frames for {len(wanted)} rows in {video.path}"
     if len(times) <= len(wanted):
         raise DatasetError(f"{problem}: frames were dropped, and nothing says which")
     nearest = np.abs(times[None] - wanted[:, None]).argmin(1)

@@ -1,7 +1,10 @@
 """Datasets whose pictures say which row they belong to: eight bars, black or white, are a number that is the action."""
 
+import shutil
+import tempfile
 from collections.abc import Sequence
 from fractions import Fraction
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -38,20 +41,33 @@ def record(
     root: Path, lengths: Sequence[int], cameras: Sequence[str] = (FRONT,), codec: str = "h264"
 ) -> list[list[int]]:
     """A dataset of one video file per camera; returns the codes of its episodes."""
+    shutil.copytree(_recorded(tuple(lengths), tuple(cameras), codec).name, root)
+    return _episodes(lengths)
+
+
+def _episodes(lengths: Sequence[int]) -> list[list[int]]:
+    codes = list(range(1, 1 + sum(lengths)))
+    return [[codes.pop(0) for _ in range(length)] for length in lengths]
+
+
+@cache
+def _recorded(lengths: tuple[int, ...], cameras: tuple[str, ...], codec: str) -> tempfile.TemporaryDirectory:
+    folder = tempfile.TemporaryDirectory()
     features = {key: {"dtype": "video", "shape": (HEIGHT, WIDTH, 3), "names": None} for key in cameras}
     features |= {"action": {"dtype": "float32", "shape": (1,), "names": None}}
+    Path(folder.name).rmdir()  # LeRobot makes it
     encoder = RGBEncoderConfig(vcodec=codec)
-    dataset = LeRobotDataset.create("local/bars", FPS, features, root=root, video_backend="pyav", rgb_encoder=encoder)
-    codes = list(range(1, 1 + sum(lengths)))
-    episodes = [[codes.pop(0) for _ in range(length)] for length in lengths]
-    for episode in episodes:
+    dataset = LeRobotDataset.create(
+        "local/bars", FPS, features, root=folder.name, video_backend="pyav", rgb_encoder=encoder
+    )
+    for episode in _episodes(lengths):
         for code in episode:
             pictures = {key: picture(code) for key in cameras}
             dataset.add_frame(pictures | {"action": np.array([code], np.float32), "task": "show a number"})
         with tamed_av1():
             dataset.save_episode(parallel_encoding=False)
     dataset.finalize()
-    return episodes
+    return folder
 
 
 def write_video(
