@@ -72,7 +72,7 @@ def _open(config: AugmentConfig, root: Path | None) -> tuple["LeRobotDatasetMeta
     from lerobot_msdyn.dataset.read import open_source
     from lerobot_msdyn.dataset.select import select_cameras, select_episodes
 
-    source = open_source(config.repo_id, root)
+    source = open_source(config.repo_id, root, config.tolerance_s)
     episodes = select_episodes(source, config.episodes)
     cameras = select_cameras(source, config.cameras, allow_moving=config.allow_moving)
     if not config.allow_moving:
@@ -116,6 +116,7 @@ def augment(
         files = source_files(source, [*episodes, *background_episodes(source, config)])
         staging.agree(describe_run(source.root, files, config), restart=config.restart)
     with OutputDataset(source, new_repo_id, new_root, staging, nvenc=config.nvenc) as output:
+        output.check(cameras, depth=config.render_depth)
         made, failures = run_local(source, episodes, cameras, config, output)
         new = [episode for episode in made if not episode.dropped]
         skipped = [str(failure) for failure in failures]

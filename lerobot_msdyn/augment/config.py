@@ -21,6 +21,9 @@ class AugmentConfig(Recipe):
     new_root: Path | None = None
     # Source episodes to use, e.g. '[0,3]'; default: all.
     episodes: list[int] | None = None
+    # How far (s) a video frame may be from its row's time, as LeRobot's tolerance_s; of no matter where a video has as
+    # many frames as its episode has rows: these belong together by their number.
+    tolerance_s: float = between(1e-4, 0.0, 1.0)
     # Processes that work on episodes at once; 0: one per core, as far as memory allows. The result is the same.
     workers: int = between(0, 0, 1024)
     # Report what would be done (episodes, disk, time) and stop.

@@ -21,6 +21,7 @@ from lerobot_msdyn.core.files import DIGEST_BYTES, digest_of_file
 from lerobot_msdyn.core.plugins import plugin_digests
 from lerobot_msdyn.core.registry import extending_packages
 from lerobot_msdyn.dataset.checks import place_problem
+from lerobot_msdyn.dataset.rows import data_files
 from lerobot_msdyn.render.devices import chosen_device
 
 LIBRARIES = ("lerobot_msdyn", "lerobot", "torch", "numpy", "opencv-python-headless", "av", "numba", "pyarrow")
@@ -60,7 +61,7 @@ def source_files(source: LeRobotDatasetMetadata, episodes: Iterable[int]) -> lis
     files = {path for path in all_files(source.root / "meta") if "msdyn" not in path.parts}
     for index in episodes:
         if place_problem(source.episodes[index], source.video_keys) is None:
-            files.add(source.root / source.get_data_file_path(index))
+            files.update(source.root / path for path in data_files(source, index))
             files.update(source.root / source.get_video_file_path(index, key) for key in source.video_keys)
     return sorted(files)
 

@@ -294,9 +294,16 @@ def _read_table(path: Path, columns: Iterable[str] | None) -> pa.Table:
         column = table[name]
         kind = str(column.type)
         number = ("int", "uint") + (("float", "double") if name.endswith("timestamp") else ())
+        if name == "tasks" and columns is not None and not _is_texts(column.type):
+            raise DatasetError(f"{path}: column tasks holds {column.type}; expected lists of texts")
         if column.null_count or (name not in ("tasks", "task") and columns is not None and not kind.startswith(number)):
             raise DatasetError(f"{path}: column {name} holds {column.null_count} empty cells of type {kind}")
     return table
+
+
+def _is_texts(kind: pa.DataType) -> bool:
+    nested = pa.types.is_list(kind) or pa.types.is_large_list(kind)
+    return nested and (pa.types.is_string(kind.value_type) or pa.types.is_large_string(kind.value_type))
 
 
 def place_problem(episode: dict[str, Any], video_keys: Iterable[str]) -> str | None:

@@ -23,9 +23,9 @@ _ALIKE = np.exp(-0.5 * (np.arange(256) / LUMA_SIGMA) ** 2).astype(np.float32) + 
 _NEAR, _FAR = (math.exp(-0.5 * (distance / SPACE_SIGMA_PX) ** 2) for distance in (0.5, 1.5))  # along one axis
 
 
-def is_subsampled(feature: dict) -> bool:
-    """Whether a video feature says that its chroma has half the size of its luma."""
-    return "420" in str((feature.get("info") or {}).get("video.pix_fmt", ""))
+def is_subsampled(pix_fmt: str) -> bool:
+    """Whether the chroma of a video of this pixel format has half the size of its luma."""
+    return "420" in pix_fmt
 
 
 def restore_chroma(frames: UInt8[Tensor, "t h w 3"]) -> UInt8[Tensor, "t h w 3"]:

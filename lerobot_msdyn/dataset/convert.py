@@ -1,21 +1,24 @@
 """A converted copy of a dataset of version v2.1; the source stays as it is."""
 
 import contextlib
+import json
 import logging
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+from lerobot.datasets.utils import DEFAULT_VIDEO_FILE_SIZE_IN_MB
 from lerobot.scripts.convert_dataset_v21_to_v30 import convert_dataset
 
 from lerobot_msdyn.core.errors import DatasetError, first_line
-from lerobot_msdyn.core.files import temporary_files_in, writing
+from lerobot_msdyn.core.files import temporary_files_in, write_whole, writing
 from lerobot_msdyn.dataset.checks import check_features, read_json, regular_file
 from lerobot_msdyn.dataset.staging import CONVERTED
 
 logger = logging.getLogger(__name__)
 
 LEGACY_VERSION = "v2.1"
+ONE_EACH_MB = 1e-9
 
 
 def converted_copy(repo_id: str, root: Path, folder: Path) -> Path:
@@ -44,9 +47,14 @@ def converted_copy(repo_id: str, root: Path, folder: Path) -> Path:
                 shutil.copyfile(regular_file(root, path.relative_to(root)), target)
     try:
         with temporary_files_in(folder), _lerobot_quiet():
-            convert_dataset(repo_id, root=copy, push_to_hub=False)
+            # A file per episode: the script puts videos together whatever their codecs, and by the lengths they claim.
+            convert_dataset(repo_id, root=copy, push_to_hub=False, video_file_size_in_mb=ONE_EACH_MB)
     except Exception as error:  # several libraries read the files, each with errors of its own
         raise DatasetError(f"{root} cannot be converted by LeRobot's script ({first_line(error)})") from error
+    new = read_json(copy, "meta/info.json")
+    new |= {"fps": info.get("fps"), "video_files_size_in_mb": DEFAULT_VIDEO_FILE_SIZE_IN_MB}  # it rounds fps
+    with writing(folder):
+        write_whole(copy / "meta" / "info.json", json.dumps(new, indent=4).encode())
     copy.rename(done)
     shutil.rmtree(copy.parent)
     return done

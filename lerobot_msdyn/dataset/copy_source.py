@@ -3,6 +3,7 @@
 The counterpart of `encode`, which takes rendered pictures.
 """
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +17,14 @@ from lerobot_msdyn.dataset.checks import picture_size
 from lerobot_msdyn.dataset.encode import StagedPictures, image_stats, with_channels
 from lerobot_msdyn.dataset.read import (
     depth_units_per_metre,
+    find_frames,
     read_colour,
     read_depth,
 )
-from lerobot_msdyn.dataset.rows import read_rows, source_file
+from lerobot_msdyn.dataset.rows import KEPT_S, off_grid_s, read_rows
 from lerobot_msdyn.dataset.video import cut_video, encoder_of, problem_of
+
+logger = logging.getLogger(__name__)
 
 
 def stage_copies(source: LeRobotDatasetMetadata, index: int, keys: list[str], folder: Path) -> StagedPictures:
@@ -30,28 +34,34 @@ def stage_copies(source: LeRobotDatasetMetadata, index: int, keys: list[str], fo
         EpisodeError: a file is absent, damaged, or not what the metadata says.
     """
     rows = read_rows(source, index)
+    off_s = off_grid_s(rows, source.fps)
+    if off_s > KEPT_S:
+        logger.warning(
+            "%s episode %d: timestamps are up to %.4f s off frame_index / fps; pictures are taken by their number, and "
+            "the new timestamps are frame_index / fps",
+            source.repo_id,
+            index,
+            off_s,
+        )
     folder.mkdir(parents=True, exist_ok=True)
     return StagedPictures(
-        videos={key: _cut(source, index, key, folder / f"{key}.mp4") for key in keys if key in source.video_keys},
+        videos={key: _cut(source, index, key, rows, folder / f"{key}.mp4") for key in keys if key in source.video_keys},
         stats={key: _stats(source, index, key, rows) for key in keys},
     )
 
 
-def _cut(source: LeRobotDatasetMetadata, index: int, key: str, path: Path) -> Path:
+def _cut(source: LeRobotDatasetMetadata, index: int, key: str, rows: pa.Table, path: Path) -> Path:
     """One episode's part of a video file."""
-    episode = source.episodes[index]
-    length = int(episode["length"])
-    file = source_file(source, index, source.get_video_file_path(index, key))
-    start = float(episode[f"videos/{key}/from_timestamp"])
+    video, numbers = find_frames(source, index, key, rows)
+    where, height, width = f"{source.repo_id} episode {index}, {key}", *picture_size(source.features[key])[:2]
     with whole_file(path) as part:
         try:
-            cut_video(file, start, length, source.fps, encoder_of(source.features[key], key), part)
+            cut_video(video, numbers, source.fps, lambda: encoder_of(source.features[key], key), part)
         except EpisodeError as error:
-            raise EpisodeError(f"{source.repo_id} episode {index}, {key}: {error}") from error
-        height, width, _ = picture_size(source.features[key])
-        problem = problem_of(part, length, source.fps, (width, height))
+            raise EpisodeError(f"{where}: {error}") from error
+        problem = problem_of(part, len(numbers), source.fps, (width, height))
     if problem is not None:
-        raise EpisodeError(f"{source.repo_id} episode {index}, {key}: {file} cannot be copied: {problem}")
+        raise EpisodeError(f"{where}: {video.path} cannot be copied: {problem}")
     return path
 
 

@@ -5,17 +5,18 @@ The counterpart of `copy_source`, which takes recorded pictures.
 
 import shutil
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.datasets.compute_stats import auto_downsample_height_width, get_feature_stats, sample_indices
 
-from lerobot_msdyn.core.errors import EpisodeError, OutputError
+from lerobot_msdyn.core.errors import EpisodeError, OutputError, first_line
 from lerobot_msdyn.core.files import writing
 from lerobot_msdyn.dataset.checks import picture_size
 from lerobot_msdyn.dataset.read import depth_units_per_metre
@@ -24,6 +25,7 @@ from lerobot_msdyn.dataset.video import VideoFile, encoder_of, nvenc_of, problem
 Stats = dict[str, dict[str, np.ndarray]]
 
 OPAQUE = 255
+CHECKED_FRAMES = 3
 AHEAD = 16  # times that may be rendered before they are encoded; it bounds the memory
 
 
@@ -82,6 +84,26 @@ def stage_pictures(
         images={key: writer.path for key, writer in writers.items() if key not in source.video_keys},
         stats={key: writer.stats() for key, writer in writers.items()},
     )
+
+
+def check_encoding(source: LeRobotDatasetMetadata, keys: Sequence[str], folder: Path, *, nvenc: bool = False) -> None:
+    """Encode a few frames of some features and decode them again.
+
+    Raises:
+        OutputError: that is not possible here, or gives other pictures.
+    """
+    for key in keys:
+        height, width, _ = picture_size(source.features[key])
+        shades = np.linspace(0, 255, width).astype(np.uint8)
+        colours = np.broadcast_to(shades[None, :, None], (height, width, 3))
+        picture = np.ones((height, width), np.float32) if key in source.depth_keys else colours
+        try:
+            stage_pictures(source, folder, [{key: picture}] * CHECKED_FRAMES, CHECKED_FRAMES, nvenc=nvenc)
+        except (av.FFmpegError, ValueError, RuntimeError) as error:
+            raise OutputError(
+                f"{source.repo_id}: new videos of {key} cannot be encoded as the source's are ({first_line(error)}); "
+                f"choose other --cameras, or another codec or pixel format in the info of {key} in meta/info.json"
+            ) from error
 
 
 def _meanwhile[T](work: Callable[[T], None], items: Iterable[T]) -> int:

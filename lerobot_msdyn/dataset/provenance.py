@@ -41,6 +41,7 @@ class Provenance:
     )  # camera -> prior -> provider, why, model
     views: dict[str, dict[str, Any]] = field(default_factory=dict)  # camera -> its `camera_pose`
     gate: dict[str, Any] = field(default_factory=dict)  # scores and what was rejected, see docs/views.md
+    times_replaced_s: float = 0.0  # how far recorded times were off frame_index / fps, which replaced them; 0: kept
 
 
 def camera_pose(source: CameraTrack, new: CameraTrack) -> dict[str, Any]:

@@ -1,12 +1,12 @@
 """Read LeRobot episodes into plain tensors: pixels, cameras, recorded depth, state and action."""
 
 import io
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import av
 import cv2
 import numpy as np
 import PIL.Image
@@ -16,7 +16,6 @@ from jaxtyping import Float, UInt8
 from lerobot.configs import DepthEncoderConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.datasets.depth_utils import dequantize_depth
-from lerobot.datasets.video_utils import decode_video_frames
 from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, OBS_STATE
 from torch import Tensor
 
@@ -26,12 +25,17 @@ from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.dataset.calibration import make_camera
 from lerobot_msdyn.dataset.checks import check_metadata, picture_size, read_json
 from lerobot_msdyn.dataset.chroma import is_subsampled, restore_chroma
-from lerobot_msdyn.dataset.rows import TIMESTAMP_TOLERANCE_S, read_rows, source_file, task_of
+from lerobot_msdyn.dataset.rows import TIMESTAMP_TOLERANCE_S, on_grid, read_rows, source_file, task_of
+from lerobot_msdyn.dataset.video_index import (
+    VIDEO_ERRORS,
+    VideoIndex,
+    decoded,
+    episodes_in_file,
+    frame_numbers,
+    index_of,
+)
 
-VIDEO_BACKEND = "pyav"
 CODEBASE_VERSION = "v3.0"
-# What a broken video can cause; AttributeError: a stream of an unknown codec has no context.
-VIDEO_ERRORS = (av.FFmpegError, OSError, ValueError, RuntimeError, IndexError, AttributeError)
 BLOCK_FRAMES = 128  # that are decoded at once
 MILLIMETRES = 1000.0
 
@@ -61,8 +65,21 @@ class Episode:
         return self.time.shape[0]
 
 
-def open_source(repo_id: str, root: Path | None = None) -> LeRobotDatasetMetadata:
+class Source(LeRobotDatasetMetadata):
+    """The metadata of a dataset that is read."""
+
+    tolerance_s: float = TIMESTAMP_TOLERANCE_S  # how far a frame may be from its row's time, as LeRobotDataset has it
+
+
+def open_source(
+    repo_id: str, root: Path | None = None, tolerance_s: float = TIMESTAMP_TOLERANCE_S
+) -> LeRobotDatasetMetadata:
     """The metadata of a dataset in `root`, else in LeRobot's home, else on the hub. Nothing is written to `root`.
+
+    Args:
+        repo_id: the dataset's name.
+        root: its folder.
+        tolerance_s: how far a video frame may be from its row's time where rows and frames are not as many, s.
 
     Raises:
         DatasetError: there is no such dataset, it is not of version v3.0, or its metadata is not what it should be.
@@ -78,7 +95,9 @@ def open_source(repo_id: str, root: Path | None = None) -> LeRobotDatasetMetadat
     check_version(folder)
     check_metadata(folder)
     try:
-        return LeRobotDatasetMetadata(repo_id, folder)
+        source = Source(repo_id, folder)
+        source.tolerance_s = tolerance_s
+        return source
     except Exception as error:  # several libraries read the metadata, each with errors of its own
         raise DatasetError(f"{folder}: the dataset's meta/ cannot be read ({first_line(error)})") from error
 
@@ -121,7 +140,7 @@ def read_episode(
         PriorError: the calibration file cannot be used.
     """
     rows = read_rows(meta, index)
-    time = torch.from_numpy(rows["timestamp"].to_numpy().astype(np.float32))
+    time = torch.from_numpy(on_grid(rows, meta.fps)["timestamp"].to_numpy().astype(np.float32))
     views = {}
     for key in cameras:
         rgb = read_colour(meta, index, key, rows)
@@ -159,8 +178,7 @@ def read_colour(meta: LeRobotDatasetMetadata, index: int, key: str, rows: pa.Tab
         EpisodeError: a frame is absent or cannot be decoded.
     """
     if key in meta.video_keys:
-        restored = restore_chroma if is_subsampled(meta.features[key]) else Tensor.contiguous
-        return _decode_video(meta, index, key, rows, lambda block: restored(block.movedim(1, -1)))
+        return _decode_video(meta, index, key, rows)
     images = [_decode_image(meta, index, key, item, cv2.IMREAD_COLOR_RGB) for item in rows[key].to_pylist()]
     return torch.from_numpy(np.stack(images))
 
@@ -187,7 +205,7 @@ def read_depth(
             )
             return depth[:, 0].float()
 
-        depth = _decode_video(meta, index, key, rows, in_metres, is_depth=True)
+        depth = _decode_video(meta, index, key, rows, in_metres)
         return depth, (encoder.depth_min, encoder.depth_max)
     images = [_decode_image(meta, index, key, item, cv2.IMREAD_UNCHANGED) for item in rows[key].to_pylist()]
     depth = torch.from_numpy(np.stack(images).astype(np.float32))
@@ -203,55 +221,60 @@ def _depth_encoder(meta: LeRobotDatasetMetadata, key: str) -> DepthEncoderConfig
         ) from error
 
 
+def find_frames(meta: LeRobotDatasetMetadata, index: int, key: str, rows: pa.Table) -> tuple[VideoIndex, list[int]]:
+    """The file in which the frames of one episode of a camera lie, and their numbers in it.
+
+    Raises:
+        EpisodeError: it is absent, cannot be read, is of another size, or does not hold one frame per row.
+    """
+    where = f"{meta.repo_id} episode {index}, {key}"
+    path = source_file(meta, index, meta.get_video_file_path(index, key))
+    height, width, _ = picture_size(meta.features[key])
+    tolerance_s = meta.tolerance_s if isinstance(meta, Source) else TIMESTAMP_TOLERANCE_S
+    try:
+        video = index_of(path)
+        if video.size != (width, height):
+            raise DatasetError(
+                f"{path} is {video.size[0]}x{video.size[1]}; meta/info.json says {width}x{height}: correct its shape"
+            )
+        placed, times = episodes_in_file(meta, index, key), rows["timestamp"].to_numpy().astype(np.float64)
+        return video, frame_numbers(video, placed, index, times, meta.fps, tolerance_s)
+    except DatasetError as error:
+        raise EpisodeError(f"{where}: {error}") from error
+    except VIDEO_ERRORS as error:
+        raise EpisodeError(f"{where}: {path} cannot be decoded ({first_line(error)})") from error
+
+
 def _decode_video(
     meta: LeRobotDatasetMetadata,
     index: int,
     key: str,
     rows: pa.Table,
-    wanted: Callable[[Tensor], Tensor],
-    *,
-    is_depth: bool = False,
+    in_metres: Callable[[Tensor], Tensor] | None = None,
 ) -> Tensor:
-    """What is wanted of all frames of a video, made from some [b,c,h,w] at a time, so that it is in memory once."""
-    path = source_file(meta, index, meta.get_video_file_path(index, key))
-    start = float(meta.episodes[index][f"videos/{key}/from_timestamp"])
-    timestamps = [start + float(t) for t in rows["timestamp"].to_pylist()]
-    where = f"{meta.repo_id} episode {index}, {key}"
-    height, width, _ = picture_size(meta.features[key])
+    """All frames of a video: colours [t,h,w,3], or what is made of the depth codes of some at a time [b,1,h,w].
+
+    Worked on in blocks, so that a video is in memory once.
+    """
+    video, numbers = find_frames(meta, index, key, rows)
+    pictures = decoded(video, numbers, is_depth=in_metres is not None)
+    restored = restore_chroma if is_subsampled(video.pix_fmt) else Tensor.contiguous
     frames: Tensor | None = None
     try:
-        _check_stream(path, width, height)
-        for first in range(0, len(timestamps), BLOCK_FRAMES):
-            decoded = decode_video_frames(
-                path,
-                timestamps[first : first + BLOCK_FRAMES],
-                TIMESTAMP_TOLERANCE_S,
-                VIDEO_BACKEND,
-                return_uint8=True,
-                is_depth=is_depth,
-            )
-            block = wanted(decoded)
+        for first in range(0, len(numbers), BLOCK_FRAMES):
+            block = torch.from_numpy(np.stack(list(itertools.islice(pictures, BLOCK_FRAMES))))
+            block = restored(block) if in_metres is None else in_metres(block[:, None])
             if frames is None:
-                frames = block.new_empty(len(timestamps), *block.shape[1:])
+                frames = block.new_empty(len(numbers), *block.shape[1:])
             frames[first : first + len(block)] = block
-    except DatasetError as error:
-        raise EpisodeError(f"{where}: {error}") from error
     except (*VIDEO_ERRORS, TypeError) as error:  # TypeError: settings of the depth's codes
         raise EpisodeError(
-            f"{where}: {path} cannot be decoded for all of its {len(timestamps)} frames ({first_line(error)})"
+            f"{meta.repo_id} episode {index}, {key}: {video.path} cannot be decoded for all of its {len(numbers)} "
+            f"frames ({first_line(error)})"
         ) from error
     if frames is None:
-        raise EpisodeError(f"{where}: the episode has no frames")
+        raise EpisodeError(f"{meta.repo_id} episode {index}, {key}: the episode has no frames")
     return frames
-
-
-def _check_stream(path: Path, width: int, height: int) -> None:
-    with av.open(str(path)) as container:
-        stream = container.streams.video[0].codec_context
-        if (stream.width, stream.height) != (width, height):
-            raise DatasetError(
-                f"{path} is {stream.width}x{stream.height}; meta/info.json says {width}x{height}: correct its shape"
-            )
 
 
 def _decode_image(meta: LeRobotDatasetMetadata, index: int, key: str, item: Any, flags: int) -> np.ndarray:

@@ -1,5 +1,7 @@
 """The parquet rows of one episode, bit for bit, once they are what the metadata says."""
 
+from collections import Counter
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,8 @@ from lerobot_msdyn.core.errors import DatasetError, EpisodeError, first_line
 from lerobot_msdyn.dataset.checks import PICTURE_DTYPES, TEXT_DTYPES, place_problem, regular_file
 
 TIMESTAMP_TOLERANCE_S = 1e-4  # LeRobot's
+KEPT_S = TIMESTAMP_TOLERANCE_S / 2  # from the grid, up to which a row's time is kept; LeRobot rounds once more
+FILES_KEPT = 256
 KINDS = {"b": "b", "i": "iu", "u": "iu", "f": "fiu"}  # kind of a feature's dtype -> kinds that its cells may have
 
 
@@ -27,12 +31,13 @@ def read_rows(meta: LeRobotDatasetMetadata, index: int) -> pa.Table:
     problem = place_problem(row, meta.video_keys)
     if problem is not None:
         raise EpisodeError(f"{where}: meta/episodes says that {problem}")
-    path = source_file(meta, index, meta.get_data_file_path(index))
+    expected = int(row["length"])
+    files = [source_file(meta, index, file) for file in data_files(meta, index)]
+    path = files[0]
     try:
-        rows = pq.read_table(path, filters=[("episode_index", "=", index)])
+        rows = pa.concat_tables([pq.read_table(file, filters=[("episode_index", "=", index)]) for file in files])
     except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
         raise EpisodeError(f"{where}: {path} cannot be read ({first_line(error)})") from error
-    expected = int(row["length"])
     if rows.num_rows != expected or expected == 0:
         raise EpisodeError(f"{where}: {path} has {rows.num_rows} rows; expected {expected}")
     columns = {key for key, feature in meta.features.items() if feature["dtype"] != "video"}
@@ -47,6 +52,57 @@ def read_rows(meta: LeRobotDatasetMetadata, index: int) -> pa.Table:
     if problem is not None:
         raise EpisodeError(f"{where}: in {path}, {problem}")
     return rows
+
+
+def data_files(meta: LeRobotDatasetMetadata, index: int) -> list[Path]:
+    """The data files, relative to the dataset, that hold the rows of an episode.
+
+    That is the one that its metadata names. Where that one does not hold them, the others are looked through: LeRobot
+    reads them all.
+    """
+    named, length = meta.get_data_file_path(index), int(meta.episodes[index]["length"])
+    if _rows_in(meta.root, named)[index] == length:
+        return [named]
+    others = [path.relative_to(meta.root) for path in sorted((meta.root / "data").glob("*/*.parquet"))]
+    found = {path: _rows_in(meta.root, path)[index] for path in others}
+    return [path for path, count in found.items() if count] if sum(found.values()) == length else [named]
+
+
+def _rows_in(root: Path, name: Path) -> Counter[int]:
+    """How many rows of each episode a data file holds; none if it cannot be read."""
+    try:
+        path = regular_file(root, name)
+        about = path.stat()
+    except (OSError, DatasetError):
+        return Counter()
+    return _counted(path, about.st_mtime_ns, about.st_size)
+
+
+@lru_cache(FILES_KEPT)
+def _counted(path: Path, changed_ns: int, size: int) -> Counter[int]:
+    try:
+        return Counter(pq.read_table(path, columns=["episode_index"])["episode_index"].to_pylist())
+    except (OSError, ValueError, KeyError, TypeError, pa.ArrowException):
+        return Counter()
+
+
+def off_grid_s(rows: pa.Table, fps: int | float) -> float:
+    """How far the recorded times of an episode are from frame_index / fps at most, s."""
+    return float(np.abs(rows["timestamp"].to_numpy() - _grid(rows, fps)).max())
+
+
+def on_grid(rows: pa.Table, fps: int | float) -> pa.Table:
+    """The rows with frame_index / fps as their times, where the recorded ones are too far off for LeRobot to read."""
+    if off_grid_s(rows, fps) <= KEPT_S:
+        return rows
+    position = rows.column_names.index("timestamp")
+    field = rows.schema.field(position)
+    return rows.set_column(position, field, [pa.array(_grid(rows, fps), field.type)])
+
+
+def _grid(rows: pa.Table, fps: int | float) -> np.ndarray:
+    """frame_index / fps in the type of the recorded times, [t] s."""
+    return (np.arange(rows.num_rows) / fps).astype(rows["timestamp"].to_numpy().dtype)
 
 
 def source_file(meta: LeRobotDatasetMetadata, index: int, relative: Path) -> Path:
@@ -95,9 +151,8 @@ def _rows_problem(rows: pa.Table, meta: LeRobotDatasetMetadata) -> str | None:
             return f"{key} holds {rows[key].type}; expected images"
     if rows["frame_index"].to_pylist() != list(range(count)):
         return f"frame_index does not go from 0 to {count - 1}"
-    late = np.abs(rows["timestamp"].to_numpy() - np.arange(count) / meta.fps).max()
-    if late > TIMESTAMP_TOLERANCE_S:
-        return f"timestamps are up to {late:.4f} s from frame_index / fps ({meta.fps} frames per second)"
+    if not pa.types.is_floating(rows["timestamp"].type):
+        return f"timestamp holds {rows['timestamp'].type}; expected seconds as floating-point numbers"
     listed = set(meta.tasks["task_index"].tolist())
     unknown = set(pc.unique(rows["task_index"]).to_pylist()) - listed
     return f"task_index is {min(unknown)}; meta/tasks.parquet has no such task" if unknown else None

@@ -4,7 +4,7 @@ import contextlib
 import logging
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from functools import cache
@@ -15,12 +15,11 @@ import numpy as np
 from lerobot.configs import DepthEncoderConfig, RGBEncoderConfig
 from lerobot.datasets.depth_utils import quantize_depth
 from lerobot.datasets.pyav_utils import write_u16_plane
-from lerobot.datasets.video_utils import decode_video_frames, get_video_duration_in_s
 
-from lerobot_msdyn.core.errors import EpisodeError, OutputError
+from lerobot_msdyn.core.errors import EpisodeError, OutputError, first_line
 from lerobot_msdyn.core.files import DISK_FAULTS
-from lerobot_msdyn.dataset.read import VIDEO_BACKEND, VIDEO_ERRORS
 from lerobot_msdyn.dataset.rows import TIMESTAMP_TOLERANCE_S
+from lerobot_msdyn.dataset.video_index import VIDEO_ERRORS, Packet, VideoIndex, decoded
 
 logger = logging.getLogger(__name__)
 
@@ -173,42 +172,65 @@ def _depth_frame(depth: np.ndarray, encoder: RGBEncoderConfig | DepthEncoderConf
 
 
 def cut_video(
-    source: Path,
-    start_s: float,
-    frames: int,
+    video: VideoIndex,
+    numbers: Sequence[int],
     fps: int | float,
-    encoder: RGBEncoderConfig | DepthEncoderConfig,
+    encoder: Callable[[], RGBEncoderConfig | DepthEncoderConfig],
     path: Path,
 ) -> None:
-    """Copy one episode out of a video file: packet by packet where it starts with a key frame, else encoded anew.
+    """Copy one episode out of a video file: packet by packet where these can be decoded alone, else encoded anew.
+
+    Args:
+        video: the file.
+        numbers: which of its frames, ascending.
+        fps: frames per second of the copy, which starts at 0 s.
+        encoder: gives the settings, should they be needed.
+        path: where the copy goes.
 
     Raises:
-        EpisodeError: the file does not hold these frames.
+        EpisodeError: the file does not hold these frames, or they must be encoded anew and cannot be.
         OSError: the disk to write to is full.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        with av.open(str(source)) as container:
-            if container.streams.video[0].codec_context is None:  # copying such a stream would crash PyAV
-                raise ValueError("unknown codec")
-        if start_s == 0 and abs(get_video_duration_in_s(source) * fps - frames) < 0.5:
-            shutil.copyfile(source, path)
-        else:
-            _copy_packets(source, start_s, frames, fps, path)
-        if frame_times(path) != [i / frame_rate(fps) for i in range(frames)]:
-            _encode_anew(source, start_s, frames, fps, encoder, path)
+        packets = _alone(video, numbers)
+        if len(packets) == len(video.packets) > 0:
+            shutil.copyfile(video.path, path)
+        elif packets:
+            _copy_packets(video, packets, fps, path)
+        if not packets or frame_times(path) != [i / frame_rate(fps) for i in range(len(numbers))]:
+            _encode_anew(video, numbers, fps, encoder(), path)
+    except OutputError as error:
+        raise EpisodeError(f"{video.path}: frames cannot be copied without encoding them anew, and {error}") from error
     except VIDEO_ERRORS as error:
         if isinstance(error, OSError) and error.errno in DISK_FAULTS:
             raise
-        raise EpisodeError(f"{source}: no {frames} frames from {start_s:.3f} s on ({type(error).__name__})") from error
+        raise EpisodeError(f"{video.path}: its frames cannot be copied ({first_line(error)})") from error
+
+
+def _alone(video: VideoIndex, numbers: Sequence[int]) -> tuple[Packet, ...]:
+    """The packets of some frames, if they can be decoded without any other; else none.
+
+    They can, where the first that is decoded is a key frame, the first that is shown, and no other lies among them.
+    """
+    shown = video.shown
+    wanted = {shown[number] for number in numbers}
+    at = [i for i, packet in enumerate(video.packets) if packet.pts in wanted]
+    packets = video.packets[at[0] : at[-1] + 1] if at else ()
+    alone = len(packets) == len(numbers) == len(wanted) and packets[0].is_key and packets[0].pts == min(wanted)
+    return packets if alone else ()
 
 
 def frame_times(path: Path) -> list[Fraction]:
-    """Presentation times (s) of all frames of a video, in order, rounded to the nearest 1/1000 of a frame."""
+    """When a video shows its frames (s), in order, rounded to the nearest 1/1000 of a frame."""
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         rate = stream.average_rate or stream.base_rate
-        times = [packet.pts * stream.time_base for packet in container.demux(stream) if packet.pts is not None]
+        times = [
+            packet.pts * stream.time_base
+            for packet in container.demux(stream)
+            if packet.pts is not None and not packet.is_discard
+        ]
     return sorted(Fraction(round(time * rate * 1000), 1000) / rate for time in times)
 
 
@@ -244,40 +266,34 @@ def problem_of(
     return None if count == frames else f"it has {count} frames; expected {frames}"
 
 
-def _copy_packets(source: Path, start_s: float, frames: int, fps: int | float, path: Path) -> None:
-    half = 0.5 / fps
-    with av.open(str(source)) as reader, av.open(str(path), "w", options={"movflags": "faststart"}) as writer:
+def _copy_packets(video: VideoIndex, packets: Sequence[Packet], fps: int | float, path: Path) -> None:
+    first, wanted = packets[0], {packet.pts for packet in packets}
+    frame_ticks = round(1 / frame_rate(fps) / video.time_base)
+    with av.open(str(video.path)) as reader, av.open(str(path), "w", options={"movflags": "faststart"}) as writer:
         stream = reader.streams.video[0]
         copy = writer.add_stream_from_template(template=stream, opaque=True)
         copy.time_base = stream.time_base
-        reader.seek(round(start_s / stream.time_base), stream=stream, backward=True, any_frame=False)
-        first = None
+        reader.seek(first.dts, stream=stream, backward=True, any_frame=False)
         for packet in reader.demux(stream):
-            if packet.dts is None or packet.pts is None:
+            if packet.dts is None or packet.pts not in wanted:
                 continue
-            time = float(packet.pts * stream.time_base) - start_s
-            if time < -half or time > frames / fps - half:
-                continue
-            first = packet.pts if first is None else first
-            packet.pts -= first
-            packet.dts -= first
+            wanted.remove(packet.pts)
+            packet.pts -= first.pts
+            packet.dts -= first.pts
+            packet.duration = packet.duration or frame_ticks  # the last frame of a file is not shown without one
             packet.stream = copy
             writer.mux(packet)
+            if not wanted:
+                break
 
 
 def _encode_anew(
-    source: Path,
-    start_s: float,
-    frames: int,
+    video: VideoIndex,
+    numbers: Sequence[int],
     fps: int | float,
     encoder: RGBEncoderConfig | DepthEncoderConfig,
     path: Path,
 ) -> None:
-    is_depth = isinstance(encoder, DepthEncoderConfig)
-    times = [start_s + i / fps for i in range(frames)]
-    pictures = decode_video_frames(
-        source, times, TIMESTAMP_TOLERANCE_S, VIDEO_BACKEND, return_uint8=True, is_depth=is_depth
-    )
     with VideoFile(path, fps, encoder) as file:
-        for picture in pictures:
-            file.add(picture[0].numpy().astype(np.uint16) if is_depth else picture.permute(1, 2, 0).numpy())
+        for picture in decoded(video, numbers, is_depth=isinstance(encoder, DepthEncoderConfig)):
+            file.add(picture)

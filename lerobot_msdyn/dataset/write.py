@@ -8,10 +8,11 @@ import copy
 import os
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -19,18 +20,19 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.datasets.compute_stats import compute_episode_stats
 from lerobot.datasets.io_utils import write_info, write_stats, write_tasks
 from lerobot.datasets.utils import update_chunk_file_indices
-from lerobot.datasets.video_utils import concatenate_video_files, get_video_duration_in_s
+from lerobot.datasets.video_utils import concatenate_video_files
 
-from lerobot_msdyn.core.errors import OutputError
-from lerobot_msdyn.core.files import temporary_files_in, writing
+from lerobot_msdyn.core.errors import OutputError, first_line
+from lerobot_msdyn.core.files import DISK_FAULTS, temporary_files_in, writing
 from lerobot_msdyn.dataset.card import licence_of, write_card
 from lerobot_msdyn.dataset.checks import PICTURE_DTYPES, TEXT_DTYPES
 from lerobot_msdyn.dataset.copy_source import stage_copies
-from lerobot_msdyn.dataset.encode import StagedPictures, Stats, stage_pictures
+from lerobot_msdyn.dataset.encode import StagedPictures, Stats, check_encoding, stage_pictures
 from lerobot_msdyn.dataset.provenance import Provenance, write_provenance, write_unseen
-from lerobot_msdyn.dataset.rows import TIMESTAMP_TOLERANCE_S, read_rows, values_of
+from lerobot_msdyn.dataset.rows import KEPT_S, TIMESTAMP_TOLERANCE_S, off_grid_s, on_grid, read_rows, values_of
 from lerobot_msdyn.dataset.staging import FINISHED, SCENE, Kept, Staging
 from lerobot_msdyn.dataset.video import frame_times
+from lerobot_msdyn.dataset.video_index import index_of
 from lerobot_msdyn.scene import store
 
 MEGABYTE = 1024**2
@@ -101,6 +103,29 @@ class OutputDataset:
         pictures = stage_pictures(self.source, folder, frames, length, nvenc=self.nvenc)
         return NewEpisode(index, provenance, pictures)
 
+    def check(self, cameras: Sequence[str], *, depth: bool) -> None:
+        """Whether what will be made can be written: by a few frames of every new video, before any work.
+
+        Args:
+            cameras: those that are re-rendered.
+            depth: whether their recorded depth is as well.
+
+        Raises:
+            OutputError: a video cannot be encoded as the source's, or LeRobot refuses the features.
+        """
+        folder = self.staging.folder / "check"
+        keys = [*cameras, *(f"{key}_depth" for key in cameras if depth and f"{key}_depth" in self.source.depth_keys)]
+        with writing(folder):
+            shutil.rmtree(folder, ignore_errors=True)
+            check_encoding(self.source, keys, folder / "videos", nvenc=self.nvenc)
+            try:
+                _Assembly(self.source, self.repo_id, folder / "dataset", self.copies)
+            except (ValueError, TypeError, KeyError) as error:
+                raise OutputError(
+                    f"{self.source.root}: LeRobot cannot make a dataset of the same features ({first_line(error)})"
+                ) from error
+            shutil.rmtree(folder)
+
     def is_finished(self, index: int) -> bool:
         """Whether all new episodes of one source episode are made."""
         return self.episode(index).has(FINISHED)
@@ -156,7 +181,7 @@ class OutputDataset:
         with writing(folder), temporary_files_in(self.staging.folder):
             shutil.rmtree(folder, ignore_errors=True)
             _Assembly(self.source, self.repo_id, folder, self.copies).build(episodes)
-            write_provenance(folder, [episode.provenance for episode in episodes], recipe_yaml)
+            write_provenance(folder, [self._with_times(episode) for episode in episodes], recipe_yaml)
             for number, episode in enumerate(episodes):
                 if episode.masks:
                     write_unseen(folder, number, episode.masks)
@@ -167,6 +192,11 @@ class OutputDataset:
             if self.root.exists():
                 raise OutputError(f"{self.root} appeared while the dataset was made; it was left as it is")
             self.staging.publish(folder, self.root, skipped)
+
+    def _with_times(self, episode: NewEpisode) -> Provenance:
+        """The record of an episode, with what was done to its times."""
+        off_s = off_grid_s(read_rows(self.source, episode.source_index), self.source.fps)
+        return replace(episode.provenance, times_replaced_s=off_s if off_s > KEPT_S else 0.0)
 
 
 def check_place(source_root: Path, root: Path) -> None:
@@ -214,7 +244,11 @@ class _RowFiles:
 
     def add(self, rows: pa.Table) -> tuple[int, int]:
         """Append an episode; returns the chunk and file index of where it went."""
-        if self._writer is not None and self._path.stat().st_size > self._meta.data_files_size_in_mb * MEGABYTE:
+        full = self._writer is not None and (
+            self._path.stat().st_size > self._meta.data_files_size_in_mb * MEGABYTE
+            or not rows.schema.equals(self._writer.schema)  # the source's files may differ in their types
+        )
+        if full:
             self._writer.close()
             self._writer = None
         if self._writer is None:
@@ -267,45 +301,67 @@ class _Assembly:
         write_stats(dict(sorted((self.meta.stats or {}).items())), self.folder)
 
     def _place_videos(self, key: str, episodes: list[NewEpisode], places: list[dict[str, Any]]) -> None:
-        """Concatenate one camera's videos into files of bounded size; copies and renders never share a file."""
+        """Concatenate one camera's videos into files of bounded size.
+
+        Copies and renders never share a file, nor do videos of which one cannot follow the other without being encoded
+        again: a source may have several codecs and pixel formats.
+        """
         files = _Files(self.meta.chunks_size)
-        for rendered in (False, True):
+        groups: dict[Any, list[tuple[int, Path]]] = {}
+        for i, episode in enumerate(episodes):
+            rendered = key in episode.pictures.videos
+            path = (episode.pictures if rendered else self.copies(episode.source_index)).videos[key]
+            groups.setdefault((rendered, index_of(path).coding), []).append((i, path))
+        for _, alike in sorted(groups.items(), key=lambda item: item[0][0]):
             group: list[tuple[int, Path]] = []
             size = 0
-            for i, episode in enumerate(episodes):
-                if (key in episode.pictures.videos) != rendered:
-                    continue
-                pictures = episode.pictures if rendered else self.copies(episode.source_index)
-                path = pictures.videos[key]
+            for i, path in alike:
                 if group and size + path.stat().st_size > self.meta.video_files_size_in_mb * MEGABYTE:
-                    self._write_video_file(key, group, files.take(), places)
+                    self._write_videos(key, group, files, places)
                     group, size = [], 0
                 group.append((i, path))
                 size += path.stat().st_size
-            if group:
-                self._write_video_file(key, group, files.take(), places)
+            self._write_videos(key, group, files, places)
+
+    def _write_videos(
+        self, key: str, group: list[tuple[int, Path]], files: "_Files", places: list[dict[str, Any]]
+    ) -> None:
+        """One file of several videos, or one for each where they cannot be put together."""
+        place = files.take()
+        if not self._write_video_file(key, group, place, places):
+            for part, own in zip(group, [place, *(files.take() for _ in group[1:])], strict=True):
+                self._write_video_file(key, [part], own, places)
 
     def _write_video_file(
         self, key: str, group: list[tuple[int, Path]], place: tuple[int, int], places: list[dict[str, Any]]
-    ) -> None:
+    ) -> bool:
+        """Whether the frames of the file that was written follow each other evenly."""
         chunk, file = place
         path = self.folder / str(self.meta.video_path).format(video_key=key, chunk_index=chunk, file_index=file)
         path.parent.mkdir(parents=True, exist_ok=True)
         if len(group) == 1:
             shutil.copyfile(group[0][1], path)
         else:
-            concatenate_video_files([part for _, part in group], path)
-        start = 0.0
-        for i, part in group:
-            end = start + get_video_duration_in_s(part)
+            try:
+                concatenate_video_files([part for _, part in group], path)
+            except (av.FFmpegError, ValueError) as error:
+                if isinstance(error, OSError) and error.errno in DISK_FAULTS:
+                    raise
+                return False
+        lengths = [len(frame_times(part)) for _, part in group]
+        if len(group) > 1 and not _is_even(path, sum(lengths), self.meta.fps):
+            return False
+        count = 0
+        for (i, _), length in zip(group, lengths, strict=True):
+            start, end = count / self.meta.fps, (count + length) / self.meta.fps
             places[i] |= {
                 f"videos/{key}/chunk_index": chunk,
                 f"videos/{key}/file_index": file,
                 f"videos/{key}/from_timestamp": start,
                 f"videos/{key}/to_timestamp": end,
             }
-            start = end
-        _check_times(path, sum(len(frame_times(part)) for _, part in group), self.meta.fps)
+            count += length
+        return True
 
     def _place_rows(self, episodes: list[NewEpisode], places: list[dict[str, Any]]) -> None:
         start = 0
@@ -325,7 +381,7 @@ class _Assembly:
 
     def _new_rows(self, episode: NewEpisode, index: int, start: int) -> pa.Table:
         """The source's rows with new indices and, for re-rendered image features, new pictures."""
-        rows = read_rows(self.source, episode.source_index)
+        rows = on_grid(read_rows(self.source, episode.source_index), self.source.fps)
         new_columns: dict[str, Any] = {
             "episode_index": [index] * rows.num_rows,
             "index": range(start, start + rows.num_rows),
@@ -355,16 +411,8 @@ class _Assembly:
         return stats
 
 
-def _check_times(path: Path, frames: int, fps: int | float) -> None:
-    """Whether the frames of a file that was put together follow each other evenly.
-
-    Raises:
-        OutputError: they do not.
-    """
+def _is_even(path: Path, frames: int, fps: int | float) -> bool:
+    """Whether a file that was put together has so many frames, the i-th at i / fps."""
     times = frame_times(path)
     late = max((abs(float(time) - i / fps) for i, time in enumerate(times)), default=0.0)
-    if len(times) != frames or late > TIMESTAMP_TOLERANCE_S:
-        raise OutputError(
-            f"{path} holds {len(times)} frames, up to {late:.4f} s from their times; expected {frames} within "
-            f"{TIMESTAMP_TOLERANCE_S} s"
-        )
+    return len(times) == frames and late < TIMESTAMP_TOLERANCE_S

@@ -48,7 +48,6 @@ def test_luma_stays() -> None:
 
 
 def test_only_video_that_says_so() -> None:
-    assert is_subsampled({"info": {"video.pix_fmt": "yuv420p"}})
-    assert not is_subsampled({"info": {"video.pix_fmt": "yuv444p"}})
-    assert not is_subsampled({"dtype": "image"})
-    assert not is_subsampled({"info": None})
+    assert is_subsampled("yuv420p")
+    assert is_subsampled("yuvj420p")
+    assert not is_subsampled("yuv444p")

@@ -46,7 +46,7 @@ def test_a_link_out_of_the_source_is_not_followed(tmp_path: Path) -> None:
 def test_only_lerobot_is_quiet_and_only_while_it_converts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def chatty(repo_id: str, root: Path, push_to_hub: bool) -> None:
+    def chatty(repo_id: str, root: Path, **_: object) -> None:
         logging.info("a line per file")
         logging.getLogger("lerobot.datasets.utils").warning("a line per field")
         logging.getLogger("of_the_user").warning("wait")

@@ -13,6 +13,7 @@ from lerobot.datasets.video_utils import concatenate_video_files, decode_video_f
 from lerobot_msdyn.core.errors import EpisodeError, OutputError
 from lerobot_msdyn.dataset import video
 from lerobot_msdyn.dataset.video import VideoFile, cut_video, encoder_of, frame_times, nvenc_of
+from lerobot_msdyn.dataset.video_index import index_of
 
 FPS = 10
 
@@ -56,7 +57,7 @@ def test_an_episode_is_cut_out_of_a_shared_file(
         encode_video(frames(length, 60 * i), parts[-1], encoder)
     shared, cut = tmp_path / "shared.mp4", tmp_path / "cut.mp4"
     concatenate_video_files(parts, shared)
-    cut_video(shared, start / FPS, count, FPS, encoder, cut)
+    cut_video(index_of(shared), range(start, start + count), FPS, lambda: encoder, cut)
     assert frame_times(cut) == [Fraction(i, FPS) for i in range(count)]
     assert torch.equal(decode(cut, count), decode(shared, 15)[start : start + count])
 
@@ -64,15 +65,15 @@ def test_an_episode_is_cut_out_of_a_shared_file(
 def test_a_cut_between_key_frames_is_encoded_anew(tmp_path: Path) -> None:
     encoder = RGBEncoderConfig(vcodec="h264", g=100)
     encode_video(frames(12), tmp_path / "a.mp4", encoder)
-    cut_video(tmp_path / "a.mp4", 0.5, 4, FPS, encoder, tmp_path / "cut.mp4")
+    cut_video(index_of(tmp_path / "a.mp4"), range(5, 9), FPS, lambda: encoder, tmp_path / "cut.mp4")
     shades = decode(tmp_path / "cut.mp4", 4).float().mean((1, 2, 3))
     assert (shades - torch.tensor([50, 60, 70, 80])).abs().max() < 5
 
 
 def test_frames_that_are_not_there(tmp_path: Path, encoder: RGBEncoderConfig) -> None:
     encode_video(frames(5), tmp_path / "a.mp4", encoder)
-    with pytest.raises(EpisodeError, match=r"a\.mp4: no 4 frames from 0\.300 s on"):
-        cut_video(tmp_path / "a.mp4", 0.3, 4, FPS, encoder, tmp_path / "cut.mp4")
+    with pytest.raises(EpisodeError, match=r"a\.mp4: its frames cannot be copied"):
+        cut_video(index_of(tmp_path / "a.mp4"), range(3, 7), FPS, lambda: encoder, tmp_path / "cut.mp4")
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="SVT-AV1 asks for it as root alone")
