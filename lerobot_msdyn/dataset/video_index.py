@@ -29,7 +29,7 @@ VIDEO_ERRORS = (av.FFmpegError, OSError, ValueError, RuntimeError, IndexError, A
 SURE = 0.25  # of a frame: a start that is nearer to a frame than this is that frame
 COVERED = 0.75  # of a frame: less than this may follow the last frame that rows name
 UPRIGHT = (1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30)  # a display matrix that changes nothing
-FILES_KEPT = 32  # some MB each
+FILES_KEPT = 8  # up to 20 MB each
 
 
 @dataclass(frozen=True)
