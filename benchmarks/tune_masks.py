@@ -5,8 +5,9 @@
 On synthetic videos (AV1, read as any dataset is) and, with --sim, on further episodes whose folders are laid out as
 `benchmarks/priors.py` wants them; never on the scenes that docs/results.md reports. A pixel's features are its
 difference to the true background of its video; those that belong to something that moves are told from the others,
-shadows included. Every video counts the same, and so do its moving and its still pixels. Prints the weights and, per
-video, the share of both that the test gets right when it is fitted to the other videos.
+shadows included. Every video counts the same, and so do its moving and its still pixels; the bias is then corrected for
+how rare moving pixels are (prior correction). Prints the weights and, per video, the share of both that the test gets
+right, at equal odds, when it is fitted to the other videos.
 """
 
 import argparse
@@ -37,7 +38,8 @@ NOISE_FLOOR = 1.0  # CIE Lab units, as in the masks
 RIDGE = 1e-3  # of the regression
 STEPS = 30  # Newton's
 
-Sample = tuple[Float[ndarray, "n f"], Bool[ndarray, " n"]]  # features of pixels; whether they belong to what moves
+# Features of pixels; whether they belong to what moves; the share of all pixels that does.
+Sample = tuple[Float[ndarray, "n f"], Bool[ndarray, " n"], float]
 
 
 def synthetic(kind: str, seed: int) -> tuple[UInt8[ndarray, "t h w 3"], Bool[ndarray, "t h w"]]:
@@ -78,15 +80,16 @@ def sampled(rgb: UInt8[ndarray, "t h w 3"], moving: Bool[ndarray, "t h w"]) -> S
         features[False].append(values[(cv2.dilate(mask, window) == 0) & known])
     parts = {kind: np.concatenate(rows) for kind, rows in features.items()}
     parts = {kind: rows[rng.permutation(len(rows))[:PIXELS]] for kind, rows in parts.items()}
-    return np.concatenate((parts[True], parts[False])), np.repeat([True, False], [len(parts[True]), len(parts[False])])
+    labels = np.repeat([True, False], [len(parts[True]), len(parts[False])])
+    return np.concatenate((parts[True], parts[False])), labels, float(moving.mean())
 
 
 def fitted(samples: list[Sample]) -> Float[ndarray, " f"]:
     """Weights, and the bias behind them, of a logistic regression in which every video and kind counts the same."""
-    x = np.concatenate([features for features, _ in samples]).astype(np.float64)
+    x = np.concatenate([features for features, _, _ in samples]).astype(np.float64)
     x = np.concatenate((x, np.ones((len(x), 1))), axis=1)
-    y = np.concatenate([moving for _, moving in samples])
-    weight = np.concatenate([np.where(m, 0.5 / m.sum(), 0.5 / (~m).sum()) for _, m in samples]) / len(samples)
+    y = np.concatenate([moving for _, moving, _ in samples])
+    weight = np.concatenate([np.where(m, 0.5 / m.sum(), 0.5 / (~m).sum()) for _, m, _ in samples]) / len(samples)
     beta = np.zeros(x.shape[1])
     ridge = RIDGE * np.eye(len(beta))
     for _ in range(STEPS):
@@ -98,7 +101,7 @@ def fitted(samples: list[Sample]) -> Float[ndarray, " f"]:
 
 def right(beta: Float[ndarray, " f"], sample: Sample) -> tuple[float, float]:
     """Shares of the still and of the moving pixels that weights get right."""
-    features, moving = sample
+    features, moving, _ = sample
     positive = features @ beta[:-1] + beta[-1] > 0
     return float((~positive[~moving]).mean()), float(positive[moving].mean())
 
@@ -125,8 +128,11 @@ def main() -> None:
     for number, (name, sample) in enumerate(named.items()):
         still, moving = right(fitted(samples[:number] + samples[number + 1 :]), sample)
         sys.stdout.write(f"{name:22s} {100 * still:8.1f} %   {100 * moving:10.1f} %\n")
-    *weights, bias = (round(float(value), 2) for value in fitted(samples))
-    sys.stdout.write(f"weights {tuple(weights)}, bias {bias}\n")
+    *weights, bias = fitted(samples)
+    share = float(np.mean([moving for _, _, moving in samples]))
+    bias += np.log(share / (1 - share))
+    rounded = tuple(round(float(value), 2) for value in weights)
+    sys.stdout.write(f"{100 * share:.1f} % of the pixels move; weights {rounded}, bias {bias:.2f}\n")
 
 
 if __name__ == "__main__":
