@@ -202,7 +202,8 @@ def _begin(place: _Place, threads: int, parent: Connection, messages: Queue) -> 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     logging.basicConfig(level=logging.INFO, handlers=[logging.handlers.QueueHandler(messages)], force=True)
-    logging.getLogger(chosen_device.__module__).setLevel(logging.ERROR)  # its parent has said what is used
+    for said_by_parent in (chosen_device, open_source):
+        logging.getLogger(said_by_parent.__module__).setLevel(logging.ERROR)
     tqdm.set_lock(threading.RLock())  # its own is for several processes, and left behind by one that ends at once
     torch.set_num_threads(threads)
     cv2.setNumThreads(threads)

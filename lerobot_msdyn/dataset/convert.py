@@ -15,6 +15,7 @@ from lerobot_msdyn.dataset.checks import check_features, read_json, regular_file
 logger = logging.getLogger(__name__)
 
 LEGACY_VERSION = "v2.1"
+CONVERTED, CONVERTING = Path("converted"), Path("converting") / "dataset"  # in the work folder
 
 
 def converted_copy(repo_id: str, root: Path, folder: Path) -> Path:
@@ -24,7 +25,7 @@ def converted_copy(repo_id: str, root: Path, folder: Path) -> Path:
         DatasetError: it is not of version v2.1, names files outside of itself, or LeRobot cannot convert it.
         OutputError: the work folder cannot be written.
     """
-    done = folder / "converted"
+    done = folder / CONVERTED
     if done.exists():
         return done
     info = read_json(root, "meta/info.json")
@@ -33,7 +34,7 @@ def converted_copy(repo_id: str, root: Path, folder: Path) -> Path:
         raise DatasetError(f"{root} is a LeRobot dataset of version {version}; --convert takes {LEGACY_VERSION} only")
     check_features(info.get("features"), root / "meta" / "info.json")
     logger.info("converting a copy of %s from %s", root, LEGACY_VERSION)
-    copy = folder / "converting" / "dataset"
+    copy = folder / CONVERTING
     with writing(folder), temporary_files_in(folder):
         shutil.rmtree(copy.parent, ignore_errors=True)
         for path in sorted(root.rglob("*")):
@@ -45,10 +46,24 @@ def converted_copy(repo_id: str, root: Path, folder: Path) -> Path:
         with temporary_files_in(folder), _lerobot_quiet():
             convert_dataset(repo_id, root=copy, push_to_hub=False)
     except Exception as error:  # several libraries read the files, each with errors of its own
-        raise DatasetError(f"{root} cannot be converted by LeRobot's script ({first_line(error)})") from error
+        reason = named_as_given(first_line(error), folder, root)
+        raise DatasetError(f"{root} cannot be converted by LeRobot's script ({reason})") from error
     copy.rename(done)
     shutil.rmtree(copy.parent)
     return done
+
+
+def named_as_given(message: str, folder: Path, root: Path) -> str:
+    """A message in which the copy in a work folder, which its reader will not find, is called by the source's name.
+
+    Args:
+        message: any text.
+        folder: the work folder.
+        root: the source.
+    """
+    for path, name in ((folder / CONVERTING, f"{root}"), (folder / CONVERTED, f"{root} (converted)")):
+        message = message.replace(str(path), name)
+    return message
 
 
 @contextlib.contextmanager

@@ -1,6 +1,9 @@
 """Read LeRobot episodes into plain tensors: pixels, cameras, recorded depth, state and action."""
 
 import io
+import logging
+import shutil
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,9 +27,12 @@ from lerobot_msdyn.core.config import CameraConfig
 from lerobot_msdyn.core.errors import DatasetError, EpisodeError, first_line
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.dataset.calibration import make_camera
-from lerobot_msdyn.dataset.checks import check_metadata, picture_size, read_json
+from lerobot_msdyn.dataset.checks import IntactEpisodes, check_metadata, picture_size, read_json
 from lerobot_msdyn.dataset.chroma import is_subsampled, restore_chroma
+from lerobot_msdyn.dataset.features import completed
 from lerobot_msdyn.dataset.rows import TIMESTAMP_TOLERANCE_S, read_rows, source_file, task_of
+
+logger = logging.getLogger(__name__)
 
 VIDEO_BACKEND = "pyav"
 CODEBASE_VERSION = "v3.0"
@@ -64,6 +70,9 @@ class Episode:
 def open_source(repo_id: str, root: Path | None = None) -> LeRobotDatasetMetadata:
     """The metadata of a dataset in `root`, else in LeRobot's home, else on the hub. Nothing is written to `root`.
 
+    Of a dataset that a killed recorder left, it is that of the leading episodes that are there, with a warning.
+    Features lack nothing that LeRobot's trainer asks for (`features.completed`).
+
     Raises:
         DatasetError: there is no such dataset, it is not of version v3.0, or its metadata is not what it should be.
     """
@@ -76,11 +85,33 @@ def open_source(repo_id: str, root: Path | None = None) -> LeRobotDatasetMetadat
             )
         folder = _from_hub(repo_id, folder)
     check_version(folder)
-    check_metadata(folder)
+    intact = check_metadata(folder)
     try:
-        return LeRobotDatasetMetadata(repo_id, folder)
+        if intact.unfinished:
+            meta = _without_unfinished(repo_id, folder, intact)
+        else:
+            meta = LeRobotDatasetMetadata(repo_id, folder)
     except Exception as error:  # several libraries read the metadata, each with errors of its own
         raise DatasetError(f"{folder}: the dataset's meta/ cannot be read ({first_line(error)})") from error
+    if intact.count < intact.listed:
+        logger.warning("%s", intact.lost_line(folder))
+        meta.info.total_episodes, meta.info.total_frames = intact.count, intact.frames
+    for key, feature in meta.features.items():
+        meta.features[key] = completed(feature)
+    return meta
+
+
+def _without_unfinished(repo_id: str, folder: Path, intact: IntactEpisodes) -> LeRobotDatasetMetadata:
+    """The metadata of a dataset some of whose tables of episodes have no footer, over which LeRobot would stumble."""
+    with tempfile.TemporaryDirectory() as temporary:
+        copy = Path(temporary)
+        names = [path.relative_to(folder) for path in (folder / "meta").iterdir() if path.is_file()]
+        for name in [*names, *(path.relative_to(folder) for path in intact.files)]:
+            (copy / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(folder / name, copy / name)
+        meta = LeRobotDatasetMetadata(repo_id, copy)
+    meta.root = folder
+    return meta
 
 
 def _from_hub(repo_id: str, folder: Path) -> Path:

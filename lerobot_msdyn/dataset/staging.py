@@ -17,6 +17,7 @@ Every file is complete or absent. A value is read back from its file also in the
 was stopped computes with the same bits as one that was not.
 """
 
+import hashlib
 import json
 import logging
 import os
@@ -29,14 +30,15 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from lerobot_msdyn.core.errors import OutputError
-from lerobot_msdyn.core.files import write_whole, writing
+from lerobot_msdyn.core.files import DIGEST_BYTES, write_whole, writing
 from lerobot_msdyn.core.serialise import ValueFileError, load_value, save_value
 
 logger = logging.getLogger(__name__)
 
 FINISHED = "finished"
 SCENE = "scene"
-PUBLISHED = "published.json"
+RUN, PUBLISHED = "run.json", "published.json"
+FINISHED_RUN = Path("meta") / "msdyn" / "finished.json"  # in the output: which run made it, and what that left out
 WORTH_KEEPING = (SCENE, "variant", FINISHED)  # what takes long to make
 MAX_NAMED = 5  # differences that a message lists
 CODE_CHANGED = "the code of lerobot_msdyn has changed"
@@ -149,7 +151,7 @@ class Staging(Kept):
         Raises:
             OutputError: what is here belongs to another run; what differs is named.
         """
-        path = self.folder / "run.json"
+        path = self.folder / RUN
         if restart:
             self.clear()
         if path.exists():
@@ -165,6 +167,10 @@ class Staging(Kept):
 
     def publish(self, folder: Path, root: Path, skipped: Sequence[str]) -> None:
         """Move a finished dataset to its place and remove this folder."""
+        run = self.folder / RUN
+        if run.exists():
+            record = {"run": _digest_of(self._read(run)), "left_out": list(skipped)}
+            write_whole(folder / FINISHED_RUN, json.dumps(record, indent=1).encode())
         write_whole(self.folder / PUBLISHED, json.dumps(list(skipped)).encode())
         folder.rename(root)
         self.remove()
@@ -200,6 +206,27 @@ def published_before(root: Path) -> list[str] | None:
         skipped = json.loads(path.read_text())
         staging.remove()
     return [str(line) for line in skipped]
+
+
+def finished_before(root: Path, describe: Callable[[], dict[str, Any]]) -> list[str] | None:
+    """What the run left out that made the dataset in `root`; None if it is not the run that is described.
+
+    Args:
+        root: the place of an output.
+        describe: returns what the result depends on (see `Staging.agree`); called if a run's record is there.
+    """
+    try:
+        record = json.loads((root / FINISHED_RUN).read_text())
+        run, left_out = record["run"], [str(line) for line in record["left_out"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return left_out if run == _digest_of(describe()) else None
+
+
+def _digest_of(run: dict[str, Any]) -> str:
+    """A digest, which shows nothing of the user's folders."""
+    content = json.dumps(run, indent=1, sort_keys=True).encode()
+    return hashlib.blake2b(content, digest_size=DIGEST_BYTES).hexdigest()
 
 
 def _how_to_go_on(changes: list[str]) -> str:
