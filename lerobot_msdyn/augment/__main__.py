@@ -41,7 +41,8 @@ def run(arguments: list[str]) -> int:
     quiet_encoders()
     root = source_folder(config)
     new_repo_id = config.new_repo_id or f"{config.repo_id}_msdyn"
-    check_name(new_repo_id)
+    if config.new_repo_id is not None:
+        check_name(config.new_repo_id)
     new_root = config.new_root
     if new_root is None and config.root is not None and config.new_repo_id is None:
         new_root = config.root.with_name(f"{config.root.name}_msdyn")
@@ -50,7 +51,8 @@ def run(arguments: list[str]) -> int:
     if left_out is None:
         left_out = finished_before(new_root, lambda: _describe(config, root))
     if left_out is not None:
-        sys.stdout.write("".join(f"{line}\n" for line in [f"finished before: written to {new_root}", *left_out]))
+        done = f"finished before: written to {new_root} (remove it to make it again)"
+        sys.stdout.write("".join(f"{line}\n" for line in [done, *left_out]))
         return EXIT_OK
     check_place(root, new_root)
     opened = None if config.convert else _open(config, config.root)
@@ -152,7 +154,8 @@ def augment(
             raise EpisodeError(f"no episode could be augmented; nothing was written. First: {first}")
 
         def report(folder: Path) -> Path:
-            return write_report(source, folder, new_root.name, made, skipped, time.perf_counter() - start)
+            seconds = time.perf_counter() - start
+            return write_report(source, folder, new_root.name, made, skipped, len(failures), seconds)
 
         output.finish(new, recipe_text(config), left_out, report)
     accounts = accounts_of(entries_of(made)[0])

@@ -200,7 +200,7 @@ def published_before(root: Path) -> list[str] | None:
     None where that is not so.
     """
     path = work_folder(root) / PUBLISHED
-    if not root.exists() or not path.exists() or (path.parent / "dataset").exists():
+    if not os.path.exists(root) or not path.exists() or (path.parent / "dataset").exists():
         return None
     with Staging(root) as staging:
         skipped = json.loads(path.read_text())

@@ -120,7 +120,7 @@ def judge(windows: Sequence[FittedWindow], camera: CameraTrack) -> Scores:
         float(np.mean([frame.angle_deg for frame in frames])),
         float(np.mean([check.track_px for check in checks])),
         ratio(new_flicker / len(frames), recorded_flicker / len(frames), FLICKER_FLOOR),
-        _sharpness_ratio(sharp),
+        sharpness_ratio(sharp),
         frames,
         _heat(np.mean(uncovered, axis=0)),
     )
@@ -131,7 +131,7 @@ def ratio(new: float, recorded: float, floor: float = SHARPNESS_FLOOR) -> float:
     return min(max(new, floor) / max(recorded, floor), MAX_RATIO)
 
 
-def _sharpness_ratio(sharp: Sequence[tuple[float, float]]) -> float:
+def sharpness_ratio(sharp: Sequence[tuple[float, float]]) -> float:
     """Mean over frames, without those whose recorded picture is far less sharp than the sharpest: they show nothing."""
     sharpest = max(recorded for _, recorded in sharp)
     return float(np.mean([ratio(*pair) for pair in sharp if pair[1] >= SHOWS_NOTHING * sharpest]))

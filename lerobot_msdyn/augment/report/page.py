@@ -103,7 +103,7 @@ def page(title: str, figures: dict[str, str], entries: Sequence[ViewEntry], skip
         title: name of the dataset.
         figures: what to say at the top, by name.
         entries: all views; those with pictures are shown at length.
-        skipped: why source episodes were left out, one line each.
+        skipped: why source episodes were left out, one line per reason.
     """
     shown = [entry for entry in entries if entry.pictures is not None or entry.dropped]
     top = "".join(f"<div><b>{text(value)}</b>{text(name)}</div>" for name, value in figures.items())
