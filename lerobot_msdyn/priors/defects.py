@@ -19,9 +19,11 @@ WIDTH_PX = 160  # at which pictures are compared
 BLANK = 0.15  # of the contrast that the video usually has, under which a frame shows nothing
 FLAT_GREY_LEVELS = 1.0  # a video whose contrast is less shows nothing at all
 USUAL = 0.8  # quantile that stands for what is usual, also where many frames are defective
-SAME = 0.25  # of the usual change where the state moves, under which a picture repeats the one before
+SAME = 0.15  # of the usual change where the state moves, under which a picture repeats the one before
+MOVES = 0.25  # of the usual speed of the state, over which it moves
 REPEATS = 3  # in a row, at least, that count as frozen; a slow camera repeats single pictures
 STRAY = 4.0  # times the largest usual change, over which the first picture is of another moment
+NOISE_RATIO = 4.0  # of the largest difference by noise to the median one
 NOISE_GREY_LEVELS = 0.25  # of which no picture is free
 STEP = 0.06  # logarithm of the gain from one frame to the next that is a step, ...
 STEP_RATIO = 6.0  # ... and times the usual one
@@ -66,20 +68,20 @@ def find_defects(rgb: UInt8[Tensor, "t h w 3"], state: Float[Tensor, "t s"] | No
         rgb: the video.
         state: that of the robot at the same times; without it nothing tells frozen pictures from a still scene.
     """
-    grey = _small(rgb)
-    contrast = grey.std((1, 2))
+    small = _small(rgb)
+    contrast = np.array([cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).std() for picture in small])
     usual = float(np.quantile(contrast, USUAL))
     blank = contrast < max(BLANK * usual, FLAT_GREY_LEVELS)
     shown = np.flatnonzero(~blank)
     if len(shown) < 2:
         return Defects(len(rgb), tuple(np.flatnonzero(blank).tolist()))
-    gain, even = _gains(grey[shown])
+    gain, even = _gains(small[shown])
     speed = None if state is None else _speed(state.numpy()[shown])
     return Defects(
         len(rgb),
         tuple(np.flatnonzero(blank).tolist()),
-        () if speed is None else _frozen(grey[shown], speed, shown),
-        bool(shown[0] == 0) and _stray_start(grey[shown], gain, speed),
+        () if speed is None else _frozen(small[shown], speed, shown),
+        bool(shown[0] == 0) and _stray_start(small[shown], gain, speed),
         tuple((int(shown[i + 1]), float(np.exp(gain[i]))) for i in _steps(gain, even)),
     )
 
@@ -97,19 +99,18 @@ def repaired(view: View, defects: Defects) -> View:
     return replace(view, rgb=view.rgb[nearest], depth=depth, stand_in=stand_in)
 
 
-def _small(rgb: UInt8[Tensor, "t h w 3"]) -> Float32[ndarray, "t a b"]:
-    """Grey levels at the size at which pictures are compared."""
+def _small(rgb: UInt8[Tensor, "t h w 3"]) -> UInt8[ndarray, "t a b 3"]:
+    """Pictures at the size at which they are compared."""
     height, width = rgb.shape[1:3]
     size = (min(width, WIDTH_PX), max(1, round(height * min(width, WIDTH_PX) / width)))
-    frames = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in rgb.numpy()]
-    return np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames]).astype(np.float32)
+    return np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in rgb.numpy()])
 
 
-def _gains(grey: Float32[ndarray, "t a b"]) -> tuple[Float[ndarray, " d"], Bool[ndarray, " d"]]:
+def _gains(small: UInt8[ndarray, "t a b 3"]) -> tuple[Float[ndarray, " d"], Bool[ndarray, " d"]]:
     """Logarithm of the gain from each frame to the next, and whether most of the picture changes by it."""
     gains, even = [], []
-    for before, after in itertools.pairwise(grey):
-        ratio = np.log((after + DARK_GREY_LEVELS) / (before + DARK_GREY_LEVELS))
+    for before, after in itertools.pairwise(small):
+        ratio = np.log((after.mean(-1) + DARK_GREY_LEVELS) / (before.mean(-1) + DARK_GREY_LEVELS))
         gains.append(float(np.median(ratio)))
         even.append(float(np.mean(np.abs(ratio - gains[-1]) < EVEN * abs(gains[-1]))) > EVEN)
     return np.array(gains), np.array(even)
@@ -128,13 +129,13 @@ def _speed(state: Float32[ndarray, "t s"]) -> Float[ndarray, " d"]:
 
 
 def _frozen(
-    grey: Float32[ndarray, "t a b"], speed: Float[ndarray, " d"], shown: Int[ndarray, " t"]
+    small: UInt8[ndarray, "t a b 3"], speed: Float[ndarray, " d"], shown: Int[ndarray, " t"]
 ) -> tuple[tuple[int, int], ...]:
     """Runs of pictures that repeat the one before while the state moves."""
     # Motion is strong in few pixels, what a codec changes in a still picture is weak everywhere.
-    change = np.array([np.percentile(np.abs(b - a), 99) for a, b in itertools.pairwise(grey)])
+    change = np.array([np.percentile(cv2.absdiff(a, b).max(-1), 99) for a, b in itertools.pairwise(small)])
     usual_speed = float(np.quantile(speed, USUAL))
-    moves = speed > SAME * usual_speed
+    moves = speed > MOVES * usual_speed
     if usual_speed <= 0 or not moves.any():
         return ()
     same = (change < SAME * float(np.quantile(change[moves], USUAL))) & moves
@@ -143,15 +144,20 @@ def _frozen(
 
 
 def _stray_start(
-    grey: Float32[ndarray, "t a b"], gain: Float[ndarray, " d"], speed: Float[ndarray, " d"] | None
+    small: UInt8[ndarray, "t a b 3"], gain: Float[ndarray, " d"], speed: Float[ndarray, " d"] | None
 ) -> bool:
     """Whether the first picture differs from the second as no other does, beyond brightness and the state's change."""
-    if len(grey) < 2 + REPEATS:
+    if len(small) < 2 + REPEATS:
         return False
-    change = [float(np.abs(b / np.exp(g) - a).mean()) for a, b, g in zip(grey, grey[1:], gain, strict=False)]
+    change = [_excess(np.abs(b / np.exp(g) - a)) for (a, b), g in zip(itertools.pairwise(small), gain, strict=True)]
     largest = max(float(np.quantile(change[1:], 0.95)), NOISE_GREY_LEVELS)
     by_state = speed is not None and speed[0] > 2 * float(np.quantile(speed[1:], 0.95))
     return change[0] > STRAY * largest and not by_state
+
+
+def _excess(difference: Float[ndarray, "a b 3"]) -> float:
+    """Mean of what is beyond noise, whose measure is the median: most of a picture stands still."""
+    return float((difference - NOISE_RATIO * np.median(difference)).clip(0).mean())
 
 
 def _runs(numbers: tuple[int, ...] | list[int]) -> tuple[tuple[int, int], ...]:
