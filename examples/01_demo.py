@@ -1,4 +1,4 @@
-"""The main job on a small made-up dataset: write it, augment it, load the result with LeRobot, look at it.
+"""The main job on a small synthetic dataset: write it, augment it, load the result with LeRobot, look at it.
 
 make demo
 """

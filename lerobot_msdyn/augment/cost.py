@@ -1,10 +1,11 @@
-"""How long a run will take, from a few frames and steps of its first episode."""
+"""How long a run will take, from a few frames and steps of its first episode that can be read."""
 
 import logging
 import shutil
 import statistics
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from lerobot_msdyn.augment.backgrounds import looked_at
 from lerobot_msdyn.augment.episode import by_feature
 from lerobot_msdyn.augment.recorded import read_recorded
 from lerobot_msdyn.core.config import Recipe
-from lerobot_msdyn.core.errors import OutputError
+from lerobot_msdyn.core.errors import EpisodeError, OutputError
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.dataset.encode import stage_pictures
 from lerobot_msdyn.reconstruction.reconstruct import FURTHER_STEPS, reconstruct
@@ -41,6 +42,23 @@ class Speeds:
     render_s: float  # per new frame, encoded
     scene_bytes: float = 0.0  # of the saved scenes of an episode, however long ...
     frame_bytes: float = 0.0  # ... and for each of its frames
+
+
+def first_speeds(source: LeRobotDatasetMetadata, episodes: Sequence[int], cameras: list[str], recipe: Recipe) -> Speeds:
+    """Those of the first of the episodes that can be read and reconstructed.
+
+    Raises:
+        EpisodeError: none of them can; the first one's reason.
+        PriorError: a prior was demanded and cannot be had.
+    """
+    first: EpisodeError | None = None
+    for index in episodes:
+        try:
+            return measure_speeds(source, index, cameras, recipe)
+        except EpisodeError as error:
+            logger.warning("not measured: %s", error)
+            first = first or error
+    raise first or EpisodeError(f"{source.repo_id}: no episode to measure")
 
 
 def measure_speeds(source: LeRobotDatasetMetadata, index: int, cameras: list[str], recipe: Recipe) -> Speeds:

@@ -28,7 +28,7 @@ from lerobot_msdyn.scene import store
 from lerobot_msdyn.scene.store import SceneSource
 from lerobot_msdyn.views.gate import judge, reasons, record
 from lerobot_msdyn.views.new_cameras import NewCameras, new_cameras
-from lerobot_msdyn.views.pictures import Picture, UnseenMasks, new_pictures, on_device
+from lerobot_msdyn.views.pictures import Picture, UnseenMasks, log_uncovered, new_pictures, on_device
 
 logger = logging.getLogger(__name__)
 
@@ -158,7 +158,9 @@ def _staged(
     )
     if dropped:
         return NewEpisode(index, provenance, dropped=dropped)
-    pictures = {key: new_pictures(scene, chosen.cameras[key], fill=recipe.fill) for key, scene in scenes.items()}
+    pictures = {
+        key: log_uncovered(new_pictures(scene, chosen.cameras[key], fill=recipe.fill)) for key, scene in scenes.items()
+    }
     masks = UnseenMasks() if recipe.masks else None
     if masks is not None:
         pictures = {key: masks.kept(key, frames) for key, frames in pictures.items()}

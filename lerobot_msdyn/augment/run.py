@@ -14,7 +14,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.augment.cost import (
-    measure_speeds,
+    first_speeds,
     predicted_output_bytes,
     predicted_scene_bytes,
     predicted_seconds,
@@ -127,7 +127,7 @@ def plan(source: LeRobotDatasetMetadata, episodes: list[int], cameras: list[str]
     disk = predicted_output_bytes(source, episodes, config)
     count = workers_for(config, frames, len(episodes))
     with threads_of_one(count):
-        speeds = measure_speeds(source, episodes[0], cameras, config)
+        speeds = first_speeds(source, episodes, cameras, config)
     seconds = predicted_seconds(speeds, source, episodes, config, count)
     scenes = predicted_scene_bytes(speeds, source, episodes, config) if config.save_scenes else 0.0
     with_scenes = f", {scenes / 1e6:.0f} MB of it saved scenes" if scenes else ""

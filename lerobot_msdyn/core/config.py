@@ -11,7 +11,7 @@ from typing import Any, Literal
 import draccus
 
 from lerobot_msdyn.core.errors import ConfigError, one_line
-from lerobot_msdyn.core.fields import AUTO, FILE, INFINITY, MAX_SEED, between, numbers_of, one_of, problems
+from lerobot_msdyn.core.fields import AUTO, FILE, INFINITY, MAX_SEED, MAX_WEIGHT, between, numbers_of, one_of, problems
 from lerobot_msdyn.core.perturbation import Perturbation
 from lerobot_msdyn.core.registries import CAMERAS, DEPTH, LOSSES, MASKS, MOTION_LEVELS, TRACKS
 from lerobot_msdyn.core.registry import Registry
@@ -228,7 +228,7 @@ class FitConfig:
     # Weight of each loss term; those that are not named, or have 0, are not used. rgb: absolute colour difference;
     # depth: absolute difference of inverse depth, relative to its mean; mask: absolute difference between the rendered
     # share of moving Gaussians and the mask of what moves; or a user's own (--fit.weights.NAME).
-    weights: dict[str, float] = numbers_of({"rgb": 1.0, "depth": 0.1, "mask": 0.1}, 0, INFINITY, registry=LOSSES)
+    weights: dict[str, float] = numbers_of({"rgb": 1.0, "depth": 0.1, "mask": 0.1}, 0, MAX_WEIGHT, registry=LOSSES)
     learning_rates: LearningRates = field(default_factory=LearningRates)
 
 

@@ -12,6 +12,7 @@ AUTO = "auto"  # the best of what can be used
 FILE = ".npz"  # ending of an exchange file
 MAX_INDEX = 1_000_000_000  # of an episode
 MAX_SEED = 4_294_967_295
+MAX_WEIGHT = 1e6  # of a loss term
 
 
 def between(default: Number, low: Number, high: Number) -> Any:

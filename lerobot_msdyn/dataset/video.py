@@ -39,16 +39,35 @@ def quiet_encoders() -> None:
 
 
 @contextlib.contextmanager
-def quiet_av1() -> Iterator[None]:
-    """An AV1 encoder that is opened here says nothing but errors, unless the user has set SVT_LOG."""
-    if SVT_LOG in os.environ:
-        yield
-        return
-    os.environ[SVT_LOG] = SVT_ERRORS
+def tamed_av1() -> Iterator[None]:
+    """An AV1 encoder that is opened here logs nothing but errors, and runs at ordinary priority.
+
+    Where root runs it, SVT-AV1 makes its own threads and the one that opens it real-time threads of the highest
+    priority, for good: they starve the rest of the machine, and where they wait for each other, themselves. `SVT_LOG`
+    is left as it is where the user has set it.
+    """
+    before, quiet = _real_time_threads(), SVT_LOG not in os.environ
+    os.environ.setdefault(SVT_LOG, SVT_ERRORS)
     try:
         yield
     finally:
-        os.environ.pop(SVT_LOG, None)
+        if quiet:
+            os.environ.pop(SVT_LOG, None)
+        for thread in _real_time_threads() - before:
+            with contextlib.suppress(OSError):  # it has ended
+                os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
+
+
+def _real_time_threads() -> set[int]:
+    """Those of this process that the system runs before all ordinary ones, where it tells."""
+    if not hasattr(os, "sched_getscheduler"):
+        return set()
+    threads = set()
+    for thread in map(int, os.listdir("/proc/self/task")):
+        with contextlib.suppress(OSError):  # it has ended
+            if os.sched_getscheduler(thread) == os.SCHED_FIFO:
+                threads.add(thread)
+    return threads
 
 
 def frame_rate(fps: int | float) -> Fraction:
@@ -124,7 +143,7 @@ class VideoFile:
             self._stream.width, self._stream.height = frame.width, frame.height
         frame.pts = self._count
         frame.time_base = 1 / self._rate
-        with contextlib.nullcontext() if self._count else quiet_av1():  # the first frame opens the encoder
+        with contextlib.nullcontext() if self._count else tamed_av1():  # the first frame opens the encoder
             packets = self._stream.encode(frame)
         self._container.mux(packets)
         self._count += 1

@@ -24,7 +24,7 @@ class Evidence:
 
     camera: CameraTrack  # at the size at which the scene was fitted, one pose per frame of the scene
     depth: Float[Tensor, "h w"]  # m, of what stands still; known or guessed everywhere
-    frames: Int[Tensor, "h w"]  # that show what stands still there; 0 = it was made up
+    frames: Int[Tensor, "h w"]  # that show what stands still there; 0 = filled from around
     moving_frames: Float[Tensor, " m"]  # frames that show each moving Gaussian
 
 

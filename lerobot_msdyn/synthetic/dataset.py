@@ -83,7 +83,7 @@ def record(
     from lerobot.configs import DepthEncoderConfig
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from lerobot_msdyn.dataset.video import quiet_av1
+    from lerobot_msdyn.dataset.video import tamed_av1
 
     if root.exists():
         raise OutputError(f"{root} exists already; remove it or choose another folder for the synthetic dataset")
@@ -101,7 +101,7 @@ def record(
     for scene, views in episodes:
         for t in range(len(scene)):
             dataset.add_frame(_frame(scene, views, features, t))
-        with quiet_av1():
+        with tamed_av1():
             # one process: forking beside the ray-caster's threads can hang
             dataset.save_episode(parallel_encoding=False)
     dataset.finalize()

@@ -33,7 +33,7 @@ class Picture:
 def new_pictures(
     scene: Reconstruction, camera: CameraTrack, frames: Tensor | None = None, *, fill: Fill = Recipe.fill
 ) -> Iterator[Picture]:
-    """The scene through another camera, holes filled; the share of what is uncovered is logged at the end.
+    """The scene through another camera, holes filled.
 
     Args:
         scene: the reconstructed camera.
@@ -41,14 +41,20 @@ def new_pictures(
         frames: those that its poses belong to (int, [t]); default: all.
         fill: how holes are filled.
     """
-    shares: list[float] = []
     for rendering, of_frames, behind in _rendered(scene, camera, frames, fill):
         composed = (rendering.rgb + missing(rendering.alpha)[..., None] * behind).clamp(0, 1)
         rgb, depths = to_device(((composed * 255).round().to(torch.uint8), rendering.depth), "cpu")
         for i, coverage in enumerate(of_frames):
-            shares.append(coverage.unseen_share)
             depth = np.where(~coverage.empty & scene.metric, depths[i].numpy(), np.float32(0))
             yield Picture(rgb[i].numpy(), depth, coverage.unseen)
+
+
+def log_uncovered(pictures: Iterator[Picture]) -> Iterator[Picture]:
+    """The same pictures; after the last one, the share of their pixels that is uncovered is logged."""
+    shares: list[float] = []
+    for picture in pictures:
+        shares.append(float(picture.unseen.mean()))
+        yield picture
     logger.info("%.1f %% of the pixels are uncovered (worst frame %.1f %%)", 100 * np.mean(shares), 100 * max(shares))
 
 

@@ -1,11 +1,20 @@
 """The time of a run, from the speeds of its parts."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from lerobot_msdyn.augment.cost import Speeds, measure_speeds, predicted_scene_bytes, predicted_seconds
+from lerobot_msdyn.augment import cost
+from lerobot_msdyn.augment.cost import (
+    Speeds,
+    first_speeds,
+    measure_speeds,
+    predicted_scene_bytes,
+    predicted_seconds,
+)
 from lerobot_msdyn.core.config import Recipe
+from lerobot_msdyn.core.errors import EpisodeError
 from lerobot_msdyn.dataset.read import open_source
 
 
@@ -18,6 +27,20 @@ def test_every_part_is_timed(desk: Path) -> None:
     assert 0 < speeds.render_s < 5
     assert 3_000 * 56 < speeds.scene_bytes < 1e6  # about one Gaussian of 56 bytes per pixel of 64x48, and moving ones
     assert 0 < speeds.frame_bytes < 64 * 48 * 40
+
+
+def test_an_episode_that_cannot_be_read_does_not_stop_the_estimate(desk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = open_source("local/desk", desk)
+
+    def measured(source: Any, index: int, *rest: Any) -> Speeds:
+        if index < 2:
+            raise EpisodeError(f"episode {index} cannot be read")
+        return Speeds(1.0, 2.0, 3.0, 4.0)
+
+    monkeypatch.setattr(cost, "measure_speeds", measured)
+    assert first_speeds(source, [0, 1, 2], [], Recipe()) == Speeds(1.0, 2.0, 3.0, 4.0)
+    with pytest.raises(EpisodeError, match="episode 0 cannot be read"):
+        first_speeds(source, [0, 1], [], Recipe())
 
 
 def test_parts_are_added_up(desk: Path) -> None:

@@ -92,6 +92,7 @@ def test_another_perturbation_type_drops_the_fields_of_the_old_one() -> None:
         (["--perturbation.type", "drift", "--perturbation.per_frame"], "perturbation.per_frame is true"),
         (["--fill", "flowers"], "fill.*flowers"),
         (["--max_unseen", "1.5"], "max_unseen is 1.5; expected a value from 0 to 1"),
+        (["--fit.weights.rgb", ".inf"], "fit.weights.rgb is inf; expected a value from 0 to 1000000.0"),
         (["--perturbation.rotation_deg", "2"], "unknown field 'perturbation.rotation_deg'"),
         (["--recipe", "absent"], "no recipe 'absent': neither a file nor one of .*quick"),
         (["local/ds"], "unexpected argument 'local/ds'"),

@@ -14,7 +14,9 @@ from lerobot_msdyn.core.plugins import import_plugins, imported_plugins, plugin_
 
 @pytest.fixture(autouse=True)
 def _forgotten_afterwards(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """What a test imports is not imported for the next."""
+    """What a test imports is not imported for the next, nor what other tests have imported for this one."""
+    for name in [name for name in sys.modules if name.startswith(plugins.PREFIX)]:
+        monkeypatch.delitem(sys.modules, name)
     before = set(sys.modules)
     monkeypatch.setattr(plugins, "_imported", {})
     yield

@@ -1,5 +1,6 @@
 """Video files: frames in, the same number of frames out, cut without loss."""
 
+import os
 from fractions import Fraction
 from pathlib import Path
 
@@ -72,6 +73,15 @@ def test_frames_that_are_not_there(tmp_path: Path, encoder: RGBEncoderConfig) ->
     encode_video(frames(5), tmp_path / "a.mp4", encoder)
     with pytest.raises(EpisodeError, match=r"a\.mp4: no 4 frames from 0\.300 s on"):
         cut_video(tmp_path / "a.mp4", 0.3, 4, FPS, encoder, tmp_path / "cut.mp4")
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="SVT-AV1 asks for it as root alone")
+def test_the_av1_encoder_leaves_no_thread_in_real_time(tmp_path: Path) -> None:
+    with VideoFile(tmp_path / "a.mp4", FPS, RGBEncoderConfig(vcodec="libsvtav1")) as file:
+        for picture in frames(2):
+            file.add(picture)
+            threads = {int(thread): os.sched_getscheduler(int(thread)) for thread in os.listdir("/proc/self/task")}
+            assert set(threads.values()) == {os.SCHED_OTHER}
 
 
 def test_encoder_is_the_sources() -> None:
