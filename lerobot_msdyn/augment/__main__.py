@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.core.cli import EXIT_INTERRUPTED, EXIT_OK, EXIT_SOME_EPISODES_FAILED, parse_config, run_command
-from lerobot_msdyn.core.errors import ConfigError, EpisodeError, MsdynError
+from lerobot_msdyn.core.errors import ConfigError, DatasetError, EpisodeError, MsdynError
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDatasetMetadata
@@ -34,7 +34,7 @@ def run(arguments: list[str]) -> int:
 
     from lerobot_msdyn.augment.run_identity import source_folder
     from lerobot_msdyn.dataset.convert import named_as_given
-    from lerobot_msdyn.dataset.staging import Staging, finished_before, published_before
+    from lerobot_msdyn.dataset.staging import Staging, published_before
     from lerobot_msdyn.dataset.video import quiet_encoders
     from lerobot_msdyn.dataset.write import check_name, check_place
 
@@ -48,11 +48,9 @@ def run(arguments: list[str]) -> int:
         new_root = config.root.with_name(f"{config.root.name}_msdyn")
     new_root = new_root or HF_LEROBOT_HOME / new_repo_id
     left_out = published_before(new_root)
-    if left_out is None:
-        left_out = finished_before(new_root, lambda: _describe(config, root))
-    if left_out is not None:
-        done = f"finished before: written to {new_root} (remove it to make it again)"
-        sys.stdout.write("".join(f"{line}\n" for line in [done, *left_out]))
+    if left_out is not None or _is_finished(config, root, new_root):
+        done = f"finished before: written to {new_root}; its report.html says what was left out. Remove it to run again"
+        sys.stdout.write("".join(f"{line}\n" for line in [done, *(left_out or [])]))
         return EXIT_OK
     check_place(root, new_root)
     opened = None if config.convert else _open(config, config.root)
@@ -87,6 +85,18 @@ def _open(config: AugmentConfig, root: Path | None) -> tuple["LeRobotDatasetMeta
     if not config.allow_moving:
         cameras = still_cameras(source, episodes, cameras, config)
     return source, episodes, cameras
+
+
+def _is_finished(config: AugmentConfig, root: Path, new_root: Path) -> bool:
+    """Whether the dataset in the output's place is what this command makes."""
+    from lerobot_msdyn.dataset.provenance import read_provenance
+    from lerobot_msdyn.dataset.staging import digest_of_run
+
+    try:
+        runs = {row.get("run") for row in read_provenance(new_root) or []}
+        return len(runs) == 1 and runs == {digest_of_run(_describe(config, root))}
+    except (DatasetError, OSError):  # nothing to compare: `check_place` says what is there
+        return False
 
 
 def _describe(config: AugmentConfig, root: Path) -> dict[str, Any]:

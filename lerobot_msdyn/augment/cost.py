@@ -109,7 +109,8 @@ def measure_speeds(source: LeRobotDatasetMetadata, index: int, cameras: list[str
 def predicted_output_bytes(source: LeRobotDatasetMetadata, episodes: list[int], recipe: Recipe) -> float:
     """Disk for the new dataset without saved scenes: each of its frames takes what one of the source takes."""
     frames = sum(int(source.episodes[index]["length"]) for index in episodes)
-    size = sum(file.stat().st_size for file in source.root.rglob("*") if file.is_file())
+    files = (file for part in ("data", "videos") for file in (source.root / part).rglob("*") if file.is_file())
+    size = sum(file.stat().st_size for file in files)
     return size * frames * (recipe.variants + int(recipe.include_source)) / max(source.total_frames, 1)
 
 

@@ -95,7 +95,6 @@ class View:
     camera: CameraTrack
     depth: Float[Tensor, "t h w"] | None = None  # m, z-depth; as recorded, see `depth_range`
     depth_range: tuple[float, float] = (0.0, float("inf"))  # m; values at the ends mean "not measured"
-    stand_in: Bool[Tensor, " t"] | None = None  # frames that could not be used and show what their neighbours show
 
     def __len__(self) -> int:
         return self.rgb.shape[0]
@@ -103,15 +102,7 @@ class View:
     def select(self, frames: slice | Int[Tensor, " s"]) -> "View":
         """The video at some of its frames."""
         depth = None if self.depth is None else self.depth[frames]
-        stand_in = None if self.stand_in is None else self.stand_in[frames]
-        return replace(self, rgb=self.rgb[frames], camera=self.camera.select(frames), depth=depth, stand_in=stand_in)
-
-    @property
-    def own(self) -> Int[Tensor, " s"]:
-        """Frames that show what was recorded then, which are all where there is no other."""
-        if self.stand_in is None or bool(self.stand_in.all()):
-            return torch.arange(len(self))
-        return (~self.stand_in).nonzero()[:, 0]
+        return replace(self, rgb=self.rgb[frames], camera=self.camera.select(frames), depth=depth)
 
     def shrunk(self, max_width: int) -> "View":
         """The same video with at most `max_width` columns; depth keeps its values (nearest pixel)."""
@@ -124,4 +115,4 @@ class View:
         if self.depth is not None:
             images = [cv2.resize(image, size, interpolation=cv2.INTER_NEAREST) for image in self.depth.numpy()]
             depth = torch.from_numpy(np.stack(images))
-        return replace(self, rgb=torch.from_numpy(rgb), camera=self.camera.resized(*size), depth=depth)
+        return View(torch.from_numpy(rgb), self.camera.resized(*size), depth, self.depth_range)

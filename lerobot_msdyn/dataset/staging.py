@@ -38,7 +38,6 @@ logger = logging.getLogger(__name__)
 FINISHED = "finished"
 SCENE = "scene"
 RUN, PUBLISHED = "run.json", "published.json"
-FINISHED_RUN = Path("meta") / "msdyn" / "finished.json"  # in the output: which run made it, and what that left out
 WORTH_KEEPING = (SCENE, "variant", FINISHED)  # what takes long to make
 MAX_NAMED = 5  # differences that a message lists
 CODE_CHANGED = "the code of lerobot_msdyn has changed"
@@ -167,13 +166,14 @@ class Staging(Kept):
 
     def publish(self, folder: Path, root: Path, skipped: Sequence[str]) -> None:
         """Move a finished dataset to its place and remove this folder."""
-        run = self.folder / RUN
-        if run.exists():
-            record = {"run": _digest_of(self._read(run)), "left_out": list(skipped)}
-            write_whole(folder / FINISHED_RUN, json.dumps(record, indent=1).encode())
         write_whole(self.folder / PUBLISHED, json.dumps(list(skipped)).encode())
         folder.rename(root)
         self.remove()
+
+    def run_digest(self) -> str:
+        """`digest_of_run` of the run that works here; empty where none was agreed on."""
+        path = self.folder / RUN
+        return digest_of_run(self._read(path)) if path.exists() else ""
 
     def _read(self, path: Path) -> Any:
         try:
@@ -208,23 +208,8 @@ def published_before(root: Path) -> list[str] | None:
     return [str(line) for line in skipped]
 
 
-def finished_before(root: Path, describe: Callable[[], dict[str, Any]]) -> list[str] | None:
-    """What the run left out that made the dataset in `root`; None if it is not the run that is described.
-
-    Args:
-        root: the place of an output.
-        describe: returns what the result depends on (see `Staging.agree`); called if a run's record is there.
-    """
-    try:
-        record = json.loads((root / FINISHED_RUN).read_text())
-        run, left_out = record["run"], [str(line) for line in record["left_out"]]
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    return left_out if run == _digest_of(describe()) else None
-
-
-def _digest_of(run: dict[str, Any]) -> str:
-    """A digest, which shows nothing of the user's folders."""
+def digest_of_run(run: dict[str, Any]) -> str:
+    """A digest of what a result depends on (see `Staging.agree`), which shows nothing of the user's folders."""
     content = json.dumps(run, indent=1, sort_keys=True).encode()
     return hashlib.blake2b(content, digest_size=DIGEST_BYTES).hexdigest()
 

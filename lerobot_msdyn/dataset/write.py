@@ -156,7 +156,8 @@ class OutputDataset:
         with writing(folder), temporary_files_in(self.staging.folder):
             shutil.rmtree(folder, ignore_errors=True)
             _Assembly(self.source, self.repo_id, folder, self.copies).build(episodes)
-            write_provenance(folder, [episode.provenance for episode in episodes], recipe_yaml)
+            provenance = [episode.provenance for episode in episodes]
+            write_provenance(folder, provenance, recipe_yaml, self.staging.run_digest())
             for number, episode in enumerate(episodes):
                 if episode.masks:
                     write_unseen(folder, number, episode.masks)

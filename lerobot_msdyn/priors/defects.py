@@ -4,7 +4,7 @@ All measures are relative to the video's own.
 """
 
 import itertools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -16,15 +16,14 @@ from torch import Tensor
 from lerobot_msdyn.core.observations import View
 
 WIDTH_PX = 160  # at which pictures are compared
-BLANK = 0.15  # of the contrast that the video usually has, under which a frame shows nothing
+BLANK = 0.05  # of the contrast that the video usually has, under which a frame shows nothing
 FLAT_GREY_LEVELS = 1.0  # a video whose contrast is less shows nothing at all
 USUAL = 0.8  # quantile that stands for what is usual, also where many frames are defective
 SAME = 0.15  # of the usual change where the state moves, under which a picture repeats the one before
 MOVES = 0.25  # of the usual speed of the state, over which it moves
 REPEATS = 3  # in a row, at least, that count as frozen; a slow camera repeats single pictures
-STRAY = 4.0  # times the largest usual change, over which the first picture is of another moment
-NOISE_RATIO = 4.0  # of the largest difference by noise to the median one
-NOISE_GREY_LEVELS = 0.25  # of which no picture is free
+STRAY = 1.5  # times the largest usual change from picture to picture, by which a stray first picture differs at least
+BELONGS = 0.5  # of that difference, under which it belongs to the episode before
 STEP = 0.06  # logarithm of the gain from one frame to the next that is a step, ...
 STEP_RATIO = 6.0  # ... and times the usual one
 EVEN = 0.5  # share of the pixels that must change alike
@@ -38,7 +37,7 @@ class Defects:
     frames: int  # of the episode
     blank: tuple[int, ...] = ()
     frozen: tuple[tuple[int, int], ...] = ()  # first and last frame that repeat the one before, while the state moves
-    stray_start: bool = False  # frame 0 shows another moment
+    stray_start: bool = False  # frame 0 belongs to the episode before
     exposure_steps: tuple[tuple[int, float], ...] = ()  # first frame with the new exposure, factor of the brightness
 
     @property
@@ -52,7 +51,7 @@ class Defects:
         if self.blank:
             found.append(f"blank: {_frames(_runs(self.blank))} (not fitted; new views show the nearest other frame)")
         if self.stray_start:
-            found.append("frame 0 shows another moment, as of the episode before (not fitted; new views show frame 1)")
+            found.append("frame 0 belongs to the episode before (not fitted; new views show frame 1)")
         if self.frozen:
             found.append(f"frozen while the state moves: {_frames(self.frozen)} (used as they are)")
         if self.exposure_steps:
@@ -61,12 +60,15 @@ class Defects:
         return found
 
 
-def find_defects(rgb: UInt8[Tensor, "t h w 3"], state: Float[Tensor, "t s"] | None) -> Defects:
+def find_defects(
+    rgb: UInt8[Tensor, "t h w 3"], state: Float[Tensor, "t s"] | None, before: UInt8[Tensor, "1 h w 3"] | None = None
+) -> Defects:
     """Look at all pictures of one camera.
 
     Args:
         rgb: the video.
         state: that of the robot at the same times; without it nothing tells frozen pictures from a still scene.
+        before: the last picture of the episode before.
     """
     small = _small(rgb)
     contrast = np.array([cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).std() for picture in small])
@@ -81,22 +83,18 @@ def find_defects(rgb: UInt8[Tensor, "t h w 3"], state: Float[Tensor, "t s"] | No
         len(rgb),
         tuple(np.flatnonzero(blank).tolist()),
         () if speed is None else _frozen(small[shown], speed, shown),
-        bool(shown[0] == 0) and _stray_start(small[shown], gain, speed),
+        before is not None and bool(shown[0] == 0) and _stray_start(small[shown], _small(before)[0]),
         tuple((int(shown[i + 1]), float(np.exp(gain[i]))) for i in _steps(gain, even)),
     )
 
 
 def repaired(view: View, defects: Defects) -> View:
-    """The video with each unusable frame showing what the nearest usable one shows; `View.stand_in` marks them."""
+    """The video with the nearest usable frame, and its camera, in place of each unusable one."""
     if not defects.unusable:
         return view
-    stand_in = torch.zeros(len(view), dtype=torch.bool)
-    stand_in[list(defects.unusable)] = True
-    usable = (~stand_in).nonzero()[:, 0]
+    usable = torch.tensor([frame for frame in range(len(view)) if frame not in defects.unusable])
     distance = (torch.arange(len(view))[:, None] - usable).abs()
-    nearest: Int[Tensor, " t"] = usable[distance.argmin(1)]
-    depth = None if view.depth is None else view.depth[nearest]
-    return replace(view, rgb=view.rgb[nearest], depth=depth, stand_in=stand_in)
+    return view.select(usable[distance.argmin(1)])
 
 
 def _small(rgb: UInt8[Tensor, "t h w 3"]) -> UInt8[ndarray, "t a b 3"]:
@@ -143,21 +141,16 @@ def _frozen(
     return tuple((int(shown[low + 1]), int(shown[high + 1])) for low, high in runs if high - low + 1 >= REPEATS)
 
 
-def _stray_start(
-    small: UInt8[ndarray, "t a b 3"], gain: Float[ndarray, " d"], speed: Float[ndarray, " d"] | None
-) -> bool:
-    """Whether the first picture differs from the second as no other does, beyond brightness and the state's change."""
+def _stray_start(small: UInt8[ndarray, "t a b 3"], before: UInt8[ndarray, "a b 3"]) -> bool:
+    """Whether the first picture jumps to the second as no other does, and is near the last of the episode before."""
     if len(small) < 2 + REPEATS:
         return False
-    change = [_excess(np.abs(b / np.exp(g) - a)) for (a, b), g in zip(itertools.pairwise(small), gain, strict=True)]
-    largest = max(float(np.quantile(change[1:], 0.95)), NOISE_GREY_LEVELS)
-    by_state = speed is not None and speed[0] > 2 * float(np.quantile(speed[1:], 0.95))
-    return change[0] > STRAY * largest and not by_state
+    jump, *changes = [_difference(a, b) for a, b in itertools.pairwise(small)]
+    return jump > STRAY * float(np.quantile(changes, 0.95)) and _difference(before, small[0]) < BELONGS * jump
 
 
-def _excess(difference: Float[ndarray, "a b 3"]) -> float:
-    """Mean of what is beyond noise, whose measure is the median: most of a picture stands still."""
-    return float((difference - NOISE_RATIO * np.median(difference)).clip(0).mean())
+def _difference(a: UInt8[ndarray, "a b 3"], b: UInt8[ndarray, "a b 3"]) -> float:
+    return float(cv2.absdiff(a, b).mean())
 
 
 def _runs(numbers: tuple[int, ...] | list[int]) -> tuple[tuple[int, int], ...]:

@@ -92,7 +92,7 @@ def fit(
     certain = certain_pixels(moves, scaled_window(MASK_BAND_PX, view.camera.width))
     targets = to_device(Targets(view, priors, moves, certain, distance), scene.device)
     terms = {name: (LOSSES.get(name), weight) for name, weight in config.weights.items() if weight > 0}
-    order, held_out = _frames(view.own, len(view), config.held_out_frames, seed)
+    order, held_out = _frames(len(view.rgb), config.held_out_frames, seed)
     enough = _Enough(targets.view, held_out, config.patience, backend)
     history: list[dict[str, Tensor]] = []
     for step in range(config.steps):
@@ -143,19 +143,16 @@ class _Enough:
         return steps - self.best_step >= self.patience
 
 
-def _frames(
-    own: Int[Tensor, " s"], count: int, held_out: int, seed: int
-) -> tuple[Iterator[Int[Tensor, "1"]], Int[Tensor, " b"]]:
-    """Of the frames that show what was recorded: those to train on, one by one without end, each once per round, and
-    those that are held out.
+def _frames(count: int, held_out: int, seed: int) -> tuple[Iterator[Int[Tensor, "1"]], Int[Tensor, " b"]]:
+    """The frames to train on, one by one without end, each once per round, and those that are held out.
 
     Of short videos, with fewer than ten frames for each that would be held out, none is.
     """
     generator = torch.Generator().manual_seed(seed)
     apart = torch.zeros(count, dtype=torch.bool)
-    if held_out > 0 and len(own) >= 10 * held_out:
-        apart[own[evenly(len(own), held_out + 2)[1:-1]]] = True
-    train = own[~apart[own]]
+    if held_out > 0 and count >= 10 * held_out:
+        apart[evenly(count, held_out + 2)[1:-1]] = True
+    train = (~apart).nonzero()[:, 0]
 
     def endless() -> Iterator[Int[Tensor, "1"]]:
         while True:

@@ -86,9 +86,8 @@ def _priors(draft: Draft) -> None:
 
 def _background(draft: Draft) -> None:
     """What the camera sees where nothing moves."""
-    own = draft.view.own
-    empty = empty_scene(draft.view.rgb[own], draft.priors.depth[own], draft.priors.instances[own])
-    draft.empty = empty if draft.shared is None else completed(empty, draft.shared.empty, len(own))
+    empty = empty_scene(draft.view.rgb, draft.priors.depth, draft.priors.instances)
+    draft.empty = empty if draft.shared is None else completed(empty, draft.shared.empty, len(draft.view))
     draft.distance = look_at_distance(draft.empty.depth)
 
 

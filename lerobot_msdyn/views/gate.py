@@ -119,7 +119,7 @@ def judge(windows: Sequence[FittedWindow], camera: CameraTrack) -> Scores:
         float(np.mean([frame.unseen for frame in frames])),
         float(np.mean([frame.angle_deg for frame in frames])),
         float(np.mean([check.track_px for check in checks])),
-        ratio(new_flicker / len(frames), recorded_flicker / len(frames), FLICKER_FLOOR),
+        ratio(new_flicker, recorded_flicker, FLICKER_FLOOR * len(frames)),
         sharpness_ratio(sharp),
         frames,
         _heat(np.mean(uncovered, axis=0)),

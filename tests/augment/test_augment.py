@@ -138,7 +138,7 @@ def test_a_truncated_video_costs_its_episode_only(
     assert run(*arguments, "--variants", "1", *FAST) == 0
     printed = capsys.readouterr().out
     assert printed.startswith(f"finished before: written to {tmp_path / 'new'}")
-    assert "skipped: local/desk episode 1, observation.images.front" in printed
+    assert "local/desk episode 1, observation.images.front" in (tmp_path / "new" / "report.html").read_text()
     assert run(*arguments, "--variants", "2", *FAST) == 2
     assert "exists already" in capsys.readouterr().err
     assert content(tmp_path / "new") == before

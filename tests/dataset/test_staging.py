@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_msdyn.core.errors import EpisodeError, OutputError
-from lerobot_msdyn.dataset.staging import FINISHED, Staging, differences, finished_before, published_before, work_folder
+from lerobot_msdyn.dataset.staging import FINISHED, Staging, differences, published_before, work_folder
 
 RUN = {"recipe": {"variants": 2, "fit": {"steps": 8}}, "source": {"meta/info.json": "a", "data/x": "b"}}
 
@@ -103,18 +103,6 @@ def test_stopped_right_after_the_dataset_was_moved(tmp_path: Path) -> None:
     (folder / "published.json").write_text('["episode 1"]')
     assert published_before(out) == ["episode 1"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]
-
-
-def test_a_finished_run_is_known_again(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    assert finished_before(out, lambda: RUN) is None
-    with Staging(out) as staging:
-        staging.agree(RUN)
-        dataset = staging.folder / "dataset"
-        dataset.mkdir()
-        staging.publish(dataset, out, ["skipped: episode 1"])
-    assert finished_before(out, lambda: RUN) == ["skipped: episode 1"]
-    assert finished_before(out, lambda: RUN | {"device": "cuda"}) is None
 
 
 def test_differences_by_name() -> None:
