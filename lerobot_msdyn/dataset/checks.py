@@ -56,12 +56,12 @@ class IntactEpisodes:
         """What is lost, and what can be done; empty if nothing is."""
         if self.count == self.listed:
             return ""
-        delete = "".join(f", delete {path.relative_to(root)}" for path in self.unfinished)
+        delete = "".join(f"{path.relative_to(root)} and " for path in self.unfinished)
         return (
             f"{root}: meta/info.json lists {self.listed} episodes, of which {self.count} (0 to {self.count - 1}) are "
             "there and used; most likely the recorder was killed before it wrote the others, which are lost: record "
-            f"them again. LeRobot opens the dataset once total_episodes is {self.count} and total_frames "
-            f"{self.frames} in meta/info.json{delete}, and no unfinished file is left in data/"
+            f"them again. For LeRobot to open the dataset, set total_episodes to {self.count} and total_frames to "
+            f"{self.frames} in meta/info.json, and delete {delete}any file without a footer in data/"
         )
 
 
