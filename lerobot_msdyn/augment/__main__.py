@@ -7,11 +7,11 @@ import logging
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.core.cli import EXIT_INTERRUPTED, EXIT_OK, EXIT_SOME_EPISODES_FAILED, parse_config, run_command
-from lerobot_msdyn.core.errors import ConfigError, EpisodeError
+from lerobot_msdyn.core.errors import ConfigError, DatasetError, EpisodeError, MsdynError
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDatasetMetadata
@@ -32,20 +32,26 @@ def run(arguments: list[str]) -> int:
     # LeRobot and torch take seconds to import: only now, so that --help and bad flags are answered at once.
     from lerobot.utils.constants import HF_LEROBOT_HOME
 
+    from lerobot_msdyn.augment.run_identity import source_folder
+    from lerobot_msdyn.dataset.convert import named_as_given
     from lerobot_msdyn.dataset.staging import Staging, published_before
     from lerobot_msdyn.dataset.video import quiet_encoders
-    from lerobot_msdyn.dataset.write import check_place
+    from lerobot_msdyn.dataset.write import check_name, check_place
 
     quiet_encoders()
-    root = config.root or HF_LEROBOT_HOME / config.repo_id
+    root = source_folder(config)
     new_repo_id = config.new_repo_id or f"{config.repo_id}_msdyn"
+    if config.new_repo_id is not None:
+        check_name(config.new_repo_id)
     new_root = config.new_root
     if new_root is None and config.root is not None and config.new_repo_id is None:
         new_root = config.root.with_name(f"{config.root.name}_msdyn")
     new_root = new_root or HF_LEROBOT_HOME / new_repo_id
-    skipped = published_before(new_root)
-    if skipped is not None:
-        return _say_skipped(f"written to {new_root} by the run before\n", skipped)
+    left_out = published_before(new_root)
+    if left_out is not None or _is_finished(config, root, new_root):
+        done = f"finished before: written to {new_root}; its report.html says what was left out. Remove it to run again"
+        sys.stdout.write("".join(f"{line}\n" for line in [done, *(left_out or [])]))
+        return EXIT_OK
     check_place(root, new_root)
     opened = None if config.convert else _open(config, config.root)
     if opened is not None and config.dry_run:
@@ -58,6 +64,8 @@ def run(arguments: list[str]) -> int:
                 if config.dry_run:
                     return _say_plan(config, *opened, new_root)
             return augment(config, *opened, new_repo_id, new_root, staging)
+    except MsdynError as error:  # a converted copy is gone when its name is read
+        raise type(error)(named_as_given(str(error), staging.folder, root)) from error
     except KeyboardInterrupt:
         kept = staging.kept()
         if kept:
@@ -80,14 +88,44 @@ def _open(config: AugmentConfig, root: Path | None) -> tuple["LeRobotDatasetMeta
     return source, episodes, cameras
 
 
+def _is_finished(config: AugmentConfig, root: Path, new_root: Path) -> bool:
+    """Whether the dataset in the output's place is what this command makes."""
+    from lerobot_msdyn.dataset.provenance import read_provenance
+    from lerobot_msdyn.dataset.staging import digest_of_run
+
+    try:
+        runs = {row.get("run") for row in read_provenance(new_root) or []}
+        return len(runs) == 1 and runs == {digest_of_run(_describe(config, root))}
+    except (DatasetError, OSError):  # nothing to compare: `check_place` says what is there
+        return False
+
+
+def _describe(config: AugmentConfig, root: Path) -> dict[str, Any]:
+    """What the result of the command depends on."""
+    from lerobot_msdyn.augment.run_identity import all_files, describe_run
+    from lerobot_msdyn.dataset.read import open_source
+    from lerobot_msdyn.dataset.select import select_episodes
+
+    if config.convert:
+        return describe_run(root, all_files(root), config)
+    source = open_source(config.repo_id, config.root)
+    return _describe_opened(config, source, select_episodes(source, config.episodes))
+
+
+def _describe_opened(config: AugmentConfig, source: "LeRobotDatasetMetadata", episodes: list[int]) -> dict[str, Any]:
+    from lerobot_msdyn.augment.backgrounds import background_episodes
+    from lerobot_msdyn.augment.run_identity import describe_run, source_files
+
+    return describe_run(source.root, source_files(source, [*episodes, *background_episodes(source, config)]), config)
+
+
 def _convert(
     config: AugmentConfig, root: Path, staging: "Staging"
 ) -> tuple["LeRobotDatasetMetadata", list[int], list[str]]:
     """The same of a converted copy in the work folder."""
-    from lerobot_msdyn.augment.run_identity import all_files, describe_run
     from lerobot_msdyn.dataset.convert import converted_copy
 
-    staging.agree(describe_run(root, all_files(root), config), restart=config.restart)
+    staging.agree(_describe(config, root), restart=config.restart)
     return _open(config, converted_copy(config.repo_id, root, staging.folder))
 
 
@@ -101,11 +139,12 @@ def augment(
     staging: "Staging",
 ) -> int:
     """Run the job that the command line described and say how it went; returns the exit code."""
-    from lerobot_msdyn.augment.backgrounds import background_episodes
+    from lerobot_msdyn.augment.cost import check_disk
+    from lerobot_msdyn.augment.failures import one_line_each
     from lerobot_msdyn.augment.report.build import entries_of, write_report
     from lerobot_msdyn.augment.report.page import accounts_of
     from lerobot_msdyn.augment.run import run_local
-    from lerobot_msdyn.augment.run_identity import describe_run, recipe_text, source_files
+    from lerobot_msdyn.augment.run_identity import recipe_text
     from lerobot_msdyn.dataset.provenance import SOURCE_VARIANT
     from lerobot_msdyn.dataset.write import OutputDataset
     from lerobot_msdyn.reconstruction.account import account_line
@@ -113,13 +152,13 @@ def augment(
 
     start = time.perf_counter()
     if not config.convert:
-        files = source_files(source, [*episodes, *background_episodes(source, config)])
-        staging.agree(describe_run(source.root, files, config), restart=config.restart)
+        staging.agree(_describe_opened(config, source, episodes), restart=config.restart)
+    check_disk(source, episodes, config, staging.folder)
     with OutputDataset(source, new_repo_id, new_root, staging, nvenc=config.nvenc) as output:
         output.check(cameras, depth=config.render_depth)
         made, failures = run_local(source, episodes, cameras, config, output)
         new = [episode for episode in made if not episode.dropped]
-        skipped = [str(failure) for failure in failures]
+        skipped = one_line_each(source.repo_id, failures) + _lost(config, source)
         dropped = [f"episode {e.source_index} variant {e.provenance.variant}: {e.dropped}" for e in made if e.dropped]
         left_out = [f"skipped: {line}" for line in skipped] + [f"dropped: {line}" for line in dropped]
         if not new:
@@ -127,7 +166,8 @@ def augment(
             raise EpisodeError(f"no episode could be augmented; nothing was written. First: {first}")
 
         def report(folder: Path) -> Path:
-            return write_report(source, folder, new_root.name, made, skipped, time.perf_counter() - start)
+            seconds = time.perf_counter() - start
+            return write_report(source, folder, new_root.name, made, skipped, len(failures), seconds)
 
         output.finish(new, recipe_text(config), left_out, report)
     accounts = accounts_of(entries_of(made)[0])
@@ -143,6 +183,17 @@ def augment(
         "--policy.push_to_hub=false\n",
         left_out,
     )
+
+
+def _lost(config: AugmentConfig, source: "LeRobotDatasetMetadata") -> list[str]:
+    """The episodes that a killed recorder has not finished, in a line, where all were asked for."""
+    from lerobot_msdyn.dataset.select import lost_episodes
+
+    lost = lost_episodes(source)
+    if config.episodes is not None or len(lost) == 0:
+        return []
+    which = f"{lost.start} to {lost.stop - 1}" if len(lost) > 1 else f"{lost.start}"
+    return [f"{source.repo_id} episodes {which}: lost, meta/info.json lists them but they are not in meta/episodes"]
 
 
 def _say_plan(

@@ -13,10 +13,10 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from numpy import ndarray
 from torch import Tensor
 
+from lerobot_msdyn.augment.recorded import read_recorded
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import EpisodeError, PriorError
 from lerobot_msdyn.core.observations import View
-from lerobot_msdyn.dataset.read import read_episode
 from lerobot_msdyn.reconstruction.pooled_background import MAX_EPISODES, SharedBackground, few, few_frames
 from lerobot_msdyn.reconstruction.share_background import moving_in_few, share_backgrounds
 from lerobot_msdyn.render.cpu.threads import torch_on_one_thread
@@ -53,9 +53,7 @@ def shared_backgrounds(
     views: dict[str, dict[int, View]] = {key: {} for key in cameras}  # by episode
     for index in episodes:
         with contextlib.suppress(EpisodeError):
-            episode = read_episode(
-                source, index, cameras, recipe.camera, recorded_depth=recipe.priors.reads_recorded_depth
-            )
+            episode, _ = read_recorded(source, index, cameras, recipe)
             for key, view in episode.views.items():
                 views[key][index] = few_frames(view).shrunk(recipe.fit.max_width)
     backgrounds: dict[str, list[SharedBackground]] = {}
@@ -78,7 +76,7 @@ def shared_backgrounds(
 
 def moving_in_episode(source: LeRobotDatasetMetadata, task: MaskTask) -> UInt8[ndarray, "t h w"]:
     """What moves in those frames of an episode that `few_frames` takes; everything, where no masks can be had."""
-    view = read_episode(source, task.episode, [task.key], task.recipe.camera, recorded_depth=False).views[task.key]
+    view = read_recorded(source, task.episode, [task.key], task.recipe, recorded_depth=False)[0].views[task.key]
     try:
         with torch_on_one_thread():
             return moving_in_few(view, task.recipe, torch.from_numpy(task.frames), task.episode, task.key).numpy()

@@ -1,6 +1,7 @@
 """How long a run will take, from a few frames and steps of its first episode that can be read."""
 
 import logging
+import shutil
 import statistics
 import tempfile
 import time
@@ -12,11 +13,11 @@ from lerobot.datasets import LeRobotDatasetMetadata
 
 from lerobot_msdyn.augment.backgrounds import looked_at
 from lerobot_msdyn.augment.episode import by_feature
+from lerobot_msdyn.augment.recorded import read_recorded
 from lerobot_msdyn.core.config import Recipe
-from lerobot_msdyn.core.errors import EpisodeError
+from lerobot_msdyn.core.errors import EpisodeError, OutputError
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.dataset.encode import stage_pictures
-from lerobot_msdyn.dataset.read import read_episode
 from lerobot_msdyn.reconstruction.reconstruct import FURTHER_STEPS, reconstruct
 from lerobot_msdyn.render.devices import chosen_device
 from lerobot_msdyn.scene.dynamic import DynamicScene
@@ -68,7 +69,7 @@ def measure_speeds(source: LeRobotDatasetMetadata, index: int, cameras: list[str
         PriorError: a prior was demanded and cannot be had.
     """
     start = time.perf_counter()
-    episode = read_episode(source, index, cameras, recipe.camera, recorded_depth=recipe.priors.reads_recorded_depth)
+    episode, _ = read_recorded(source, index, cameras, recipe)
     frames = len(episode.time)
     read_s = (time.perf_counter() - start) / frames
     short = replace(
@@ -103,6 +104,44 @@ def measure_speeds(source: LeRobotDatasetMetadata, index: int, cameras: list[str
             stage_pictures(source, Path(folder), pictures, len(part.rgb))
             render_s += (time.perf_counter() - start) / len(part.rgb)
     return Speeds(read_s, prepare_s, step_s, render_s, scene_bytes, frame_bytes)
+
+
+def predicted_output_bytes(source: LeRobotDatasetMetadata, episodes: list[int], recipe: Recipe) -> float:
+    """Disk for the new dataset without saved scenes: each of its frames takes what one of the source takes."""
+    frames = sum(int(source.episodes[index]["length"]) for index in episodes)
+    files = (file for part in ("data", "videos") for file in (source.root / part).rglob("*") if file.is_file())
+    size = sum(file.stat().st_size for file in files)
+    return size * frames * (recipe.variants + int(recipe.include_source)) / max(source.total_frames, 1)
+
+
+def check_disk(source: LeRobotDatasetMetadata, episodes: list[int], recipe: Recipe, folder: Path) -> None:
+    """Whether a run has the disk that it will take: the output, and as much again while it is made.
+
+    Args:
+        source: the dataset.
+        episodes: those that are used.
+        recipe: the settings.
+        folder: the work folder; what an unfinished run has left in it counts as written.
+
+    Raises:
+        OutputError: not even the output fits.
+    """
+    output = predicted_output_bytes(source, episodes, recipe)
+    there = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    free = shutil.disk_usage(folder).free
+    if free + there < output:
+        raise OutputError(
+            f"{folder.parent} has {free / 1e6:.0f} MB of free disk; the output takes about {output / 1e6:.0f} MB, and "
+            "as much again while it is made: make room there, choose another --new_root, or fewer --episodes or "
+            "--variants"
+        )
+    if free + there < 2 * output:
+        logger.warning(
+            "%s has %.0f MB of free disk; making the output takes about %.0f MB: it may not suffice",
+            folder.parent,
+            free / 1e6,
+            2 * output / 1e6,
+        )
 
 
 def predicted_scene_bytes(speeds: Speeds, source: LeRobotDatasetMetadata, episodes: list[int], recipe: Recipe) -> float:

@@ -12,12 +12,13 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from torch import Tensor
 
 from lerobot_msdyn.augment.backgrounds import Backgrounds
+from lerobot_msdyn.augment.recorded import read_recorded
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.dataset.calibration import read_calibration
 from lerobot_msdyn.dataset.provenance import SOURCE_VARIANT, Provenance, camera_pose
-from lerobot_msdyn.dataset.read import depth_key_of, read_episode
+from lerobot_msdyn.dataset.read import depth_key_of
 from lerobot_msdyn.dataset.staging import SCENE
 from lerobot_msdyn.dataset.write import NewEpisode, OutputDataset
 from lerobot_msdyn.reconstruction.reconstruct import reconstruct
@@ -51,7 +52,12 @@ def augment_episode(
         EpisodeError: the episode cannot be read.
         PriorError: a prior was demanded and cannot be had.
     """
-    episode = read_episode(source, index, cameras, recipe.camera, recorded_depth=recipe.priors.reads_recorded_depth)
+    episode, defects = read_recorded(source, index, cameras, recipe)
+    noted = {key: found.lines() for key, found in defects.items()}
+    for key, lines in noted.items():
+        if lines:
+            logger.warning("%s episode %d, %s: %s", source.repo_id, index, key, "; ".join(lines))
+    other = _other_pose(recipe, index, episode.views[cameras[0]])
     kept = output.episode(index)
     scenes = {}
     for key, view in episode.views.items():
@@ -69,13 +75,12 @@ def augment_episode(
         scenes[key] = kept.keep(f"{SCENE}_{key}", make_scene)
     ready = {key: on_device(scene, chosen_device(recipe.device)) for key, scene in scenes.items()}
     priors = {key: scene.provenance for key, scene in scenes.items()}
-    other = _other_pose(recipe, index, episode.views[cameras[0]])
     new = []
     if recipe.include_source:
         new.append(NewEpisode(index, Provenance(source.repo_id, index, SOURCE_VARIANT, recipe.seed, {}, priors)))
     for variant in range(recipe.variants):
         progress(f"episode {index}: rendering variant {variant}", 0.0)
-        make_episode = functools.partial(_rendered, source, index, variant, recipe, output, ready, other)
+        make_episode = functools.partial(_rendered, source, index, variant, recipe, output, ready, other, noted)
         new.append(kept.keep(f"variant_{variant:02d}", make_episode))
         progress("", 0.5 / recipe.variants)
     if recipe.save_scenes:
@@ -92,10 +97,13 @@ def _rendered(
     output: OutputDataset,
     scenes: Mapping[str, Reconstruction],
     other: Tensor | None,
+    noted: Mapping[str, list[str]],
 ) -> NewEpisode:
     """One new episode, rendered and encoded; nothing is rendered of one that was dropped."""
     start = time.perf_counter()
     chosen, gate = _accepted(scenes, recipe, index, variant, other)
+    for key, lines in noted.items():
+        gate["views"][key]["defects"] = lines
     seconds = {"judging": round(time.perf_counter() - start, 1)}
     seconds |= {f"fitting {key}": round(scene.seconds["fit"], 1) for key, scene in scenes.items()}
     dropped = gate["rejected"][-1] if len(gate["rejected"]) > recipe.gate.redraws else ""

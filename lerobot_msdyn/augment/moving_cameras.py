@@ -11,10 +11,11 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from numpy import ndarray
 from torch import Tensor
 
+from lerobot_msdyn.augment.recorded import read_recorded
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import DatasetError, EpisodeError
 from lerobot_msdyn.core.sampling import evenly, scaled_px
-from lerobot_msdyn.dataset.read import Episode, read_episode
+from lerobot_msdyn.dataset.read import Episode
 from lerobot_msdyn.priors.camera.steadiness import SWAY_PX, camera_motion_px
 
 logger = logging.getLogger(__name__)
@@ -53,7 +54,7 @@ def _first_readable(
     errors = []
     for index in episodes:
         try:
-            return read_episode(source, index, cameras, recipe.camera, recorded_depth=False)
+            return read_recorded(source, index, cameras, recipe, recorded_depth=False)[0]
         except EpisodeError as error:
             errors.append(error)
     raise EpisodeError(

@@ -13,10 +13,18 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from lerobot_msdyn.augment.config import AugmentConfig
-from lerobot_msdyn.augment.cost import first_speeds, predicted_scene_bytes, predicted_seconds
+from lerobot_msdyn.augment.cost import (
+    first_speeds,
+    predicted_output_bytes,
+    predicted_scene_bytes,
+    predicted_seconds,
+)
 from lerobot_msdyn.augment.episode import augment_episode
+from lerobot_msdyn.augment.failures import same_reason
+from lerobot_msdyn.augment.run_identity import source_folder
 from lerobot_msdyn.augment.workers import Work, Workers, threads_of_one, workers_for
 from lerobot_msdyn.core.errors import EpisodeError, MsdynError
+from lerobot_msdyn.dataset.convert import named_as_given
 from lerobot_msdyn.dataset.read import depth_key_of
 from lerobot_msdyn.dataset.write import NewEpisode, OutputDataset
 from lerobot_msdyn.render.devices import chosen_device
@@ -32,12 +40,13 @@ def run_local(
     cameras: list[str],
     config: AugmentConfig,
     output: OutputDataset,
-) -> tuple[list[NewEpisode], list[EpisodeError]]:
-    """All episodes on this machine; an episode that cannot be read is reported and left out."""
+) -> tuple[list[NewEpisode], dict[int, str]]:
+    """All episodes on this machine, and why some failed: they are left out, and every reason is logged once."""
     chosen_device(config.device)  # complains, or says what is used, before anything is done
     _say_what_is_assumed(source, cameras, config)
     new: list[NewEpisode] = []
-    failures: list[EpisodeError] = []
+    failures: dict[int, str] = {}
+    reasons: set[str] = set()
     bar_format = "{desc} |{bar}| {percentage:3.0f} % of {total} episodes [{elapsed}<{remaining}]"
     watched = sys.stderr.isatty()  # in a file a bar has a line per update
     interval_s = 0.1 if watched else UNWATCHED_S
@@ -54,8 +63,12 @@ def run_local(
             for index, failure in zip(episodes, attempts, strict=True):
                 if failure is None:
                     new += output.finish_episode(index, _make(work, index))
-                else:
-                    failures.append(EpisodeError(failure))
+                    continue
+                failures[index] = named_as_given(failure, output.staging.folder, source_folder(config))
+                reason = same_reason(source.repo_id, index, failures[index])
+                if reason not in reasons:
+                    reasons.add(reason)
+                    logger.error("skipped: %s", failures[index])
         bar.update(len(episodes) - bar.n)
     return new, failures
 
@@ -81,12 +94,10 @@ def attempt(work: Work, index: int) -> str | None:
     try:
         work.output.finish_episode(index, make)
     except EpisodeError as error:
-        logger.error("skipped: %s", error)
         return str(error)
     except MsdynError:
         raise
     except torch.OutOfMemoryError:
-        logger.error("skipped episode %d: the memory of the GPU is full", index)
         name = f"{work.source.repo_id} episode {index}"
         return f"{name}: the memory of the GPU is full; try fewer --workers, or a smaller --fit.max_width"
     except Exception as error:  # hours of other episodes' work must not be lost to a fault in one
@@ -113,8 +124,7 @@ def plan(source: LeRobotDatasetMetadata, episodes: list[int], cameras: list[str]
     """What a run would do: episodes, pictures, disk and time, the last by doing a little of it."""
     frames = sum(int(source.episodes[index]["length"]) for index in episodes)
     copies = config.variants + int(config.include_source)
-    size = sum(file.stat().st_size for file in source.root.rglob("*") if file.is_file())
-    disk = size * frames * copies / max(source.total_frames, 1)
+    disk = predicted_output_bytes(source, episodes, config)
     count = workers_for(config, frames, len(episodes))
     with threads_of_one(count):
         speeds = first_speeds(source, episodes, cameras, config)

@@ -14,6 +14,7 @@ from typing import Any
 import draccus
 import yaml
 from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.utils.constants import HF_LEROBOT_HOME
 
 from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.core.config import Recipe
@@ -49,6 +50,11 @@ def describe_run(root: Path, files: Iterable[Path], config: AugmentConfig) -> di
         "plugins": plugin_digests(),
         "versions": versions() | extending_packages() | {"code": code_digest()},
     }
+
+
+def source_folder(config: AugmentConfig) -> Path:
+    """Where the user's dataset is, unless it comes from the hub."""
+    return config.root or Path(HF_LEROBOT_HOME) / config.repo_id
 
 
 def all_files(root: Path) -> list[Path]:

@@ -140,7 +140,8 @@ class Workers(Processes[Work]):
 
 def _begin(place: _Place, threads: int, progress: Progress) -> Work:
     """Make a new process a worker."""
-    logging.getLogger(chosen_device.__module__).setLevel(logging.ERROR)  # its parent has said what is used
+    for said_by_parent in (chosen_device, open_source):
+        logging.getLogger(said_by_parent.__module__).setLevel(logging.ERROR)
     tqdm.set_lock(threading.RLock())  # its own is for several processes, and left behind by one that ends at once
     torch.set_num_threads(threads)
     cv2.setNumThreads(threads)

@@ -81,6 +81,8 @@ def format_help(config_class: type, aliases: Mapping[str, str], command: str) ->
         f"  --recipe NAME_OR_FILE\n      A YAML file with any of the fields below, read before the flags; "
         f"by name: {recipes}.\n  --plugins MODULE_OR_FILE.py\n      Your own providers, motion levels, perturbations "
         f"or loss terms, imported before the recipe is read (docs/extending.md).\n\nShort names: {names}.\n"
+        "Exit codes: 0 done, or finished before; 1 some episodes or views were left out; 2 bad input; "
+        "130 interrupted.\n"
     )
     return head + "".join(_help_lines(config_class, ""))
 

@@ -4,12 +4,15 @@ LeRobot trusts its metadata: it formats paths with it, hands encoder options to 
 own folder where a file is absent. So files and values are looked at here first, and a wrong one is named in one line.
 """
 
+import itertools
 import json
 import math
+import os
 import re
 import stat
 import string
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,14 +38,38 @@ PLACES = ("chunk_index", "file_index")
 SAFE_OPTIONS = {"crf", "preset", "tune", "profile", "level", "qp", "bf", "refs", "threads", "row-mt", "cpu-used"}
 SAFE_PARAMS = {"lossless", "log-level", "crf", "preset", "tune", "keyint", "fast-decode", "lp", "film-grain"}
 DEPTH_NUMBERS = {"video.depth_min", "video.depth_max", "video.shift"}
+PARQUET_END = b"PAR1"
 PARAMS_OPTIONS = {"x264-params", "x265-params", "svtav1-params"}
 
 
-def check_metadata(root: Path) -> None:
+@dataclass(frozen=True)
+class IntactEpisodes:
+    """The leading episodes that are there; a recorder that was killed has listed more than it has finished."""
+
+    listed: int  # by info.json
+    count: int  # there: 0 to count - 1
+    frames: int  # of these
+    files: list[Path]  # finished ones of meta/episodes/
+    unfinished: list[Path]
+
+    def lost_line(self, root: Path) -> str:
+        """What is lost, and what can be done; empty if nothing is."""
+        if self.count == self.listed:
+            return ""
+        delete = "".join(f"{path.relative_to(root)} and " for path in self.unfinished)
+        return (
+            f"{root}: meta/info.json lists {self.listed} episodes, of which {self.count} (0 to {self.count - 1}) are "
+            "there and used; most likely the recorder was killed before it wrote the others, which are lost: record "
+            f"them again. For LeRobot to open the dataset, set total_episodes to {self.count} and total_frames to "
+            f"{self.frames} in meta/info.json, and delete {delete}any file without a footer in data/"
+        )
+
+
+def check_metadata(root: Path) -> IntactEpisodes:
     """Look at meta/ of a dataset of version v3.0.
 
     Raises:
-        DatasetError: a file or a value is not what it should be.
+        DatasetError: a file or a value is not what it should be, or no episode is there.
     """
     info = read_json(root, "meta/info.json")
     where = root / "meta" / "info.json"
@@ -51,7 +78,7 @@ def check_metadata(root: Path) -> None:
     if (root / "meta" / "stats.json").exists():
         read_json(root, "meta/stats.json")
     _check_tasks(root, info["total_tasks"])
-    _check_episodes(root, info, [key for key, feature in features.items() if feature["dtype"] == "video"])
+    return _check_episodes(root, info, [key for key, feature in features.items() if feature["dtype"] == "video"])
 
 
 def read_json(root: Path, name: str) -> dict[str, Any]:
@@ -199,15 +226,18 @@ def _check_feature(key: object, feature: object, where: Path) -> None:
     if not isinstance(feature.get("names"), list | tuple | dict | None):
         raise DatasetError(f"{name} has names {_short(feature['names'])}; expected a list")
     info = feature.get("info")
-    if not isinstance(info, dict | None):
-        raise DatasetError(f"{name} has info {_short(info)}; expected a mapping")
+    legacy = feature.get("video_info")
+    for block in (info, legacy):
+        if not isinstance(block, dict | None):
+            raise DatasetError(f"{name} has info {_short(block)}; expected a mapping")
     if dtype in PICTURE_DTYPES:
         if len(sides) != 3 or max(picture_size(feature)[:2]) > MAX_SIDE_PX or picture_size(feature)[2] not in (1, 3, 4):
             raise DatasetError(
                 f"{name} has shape {_short(shape)}; expected a height and width up to {MAX_SIDE_PX} and 1, 3 or 4 "
                 "channels"
             )
-        _check_encoder(name, info or {})
+        for block in (info, legacy):
+            _check_encoder(name, block or {})
 
 
 def _is_numeric(dtype: object) -> bool:
@@ -248,7 +278,8 @@ def _check_tasks(root: Path, total: int) -> None:
     texts = [
         column for column in table.columns if pa.types.is_string(column.type) or pa.types.is_large_string(column.type)
     ]
-    complete = len(indices) == total and sorted(map(str, indices)) == sorted(map(str, range(total)))
+    # A recorder that is killed may have written a task that it has not counted yet.
+    complete = total <= len(indices) and sorted(map(str, indices)) == sorted(map(str, range(len(indices))))
     if len(table.column_names) != 2 or len(texts) != 1 or not complete:
         raise DatasetError(
             f"{root / 'meta' / 'tasks.parquet'}: expected a text and a task_index from 0 to {total - 1} for each task, "
@@ -256,28 +287,46 @@ def _check_tasks(root: Path, total: int) -> None:
         )
 
 
-def _check_episodes(root: Path, info: dict[str, Any], video_keys: list[str]) -> None:
+def _check_episodes(root: Path, info: dict[str, Any], video_keys: list[str]) -> IntactEpisodes:
     folder = root / "meta" / "episodes"
-    files = sorted(folder.glob("*/*.parquet"))
+    files = [regular_file(root, path.relative_to(root)) for path in sorted(folder.glob("*/*.parquet"))]
     if not files:
         raise DatasetError(f"{folder} holds no chunk-*/file-*.parquet")
+    finished = list(itertools.takewhile(_is_finished, files))
+    if not finished:
+        raise DatasetError(
+            f"{files[0]} was never finished (it has no footer), so that no episode is known: most likely the recorder "
+            "was killed; record the dataset again"
+        )
     columns = {"episode_index", "length", "dataset_from_index", "dataset_to_index", "tasks"}
     columns |= {f"data/{place}" for place in PLACES}
     columns |= {f"videos/{key}/{name}" for key in video_keys for name in (*PLACES, "from_timestamp", "to_timestamp")}
-    tables = [_read_table(regular_file(root, path.relative_to(root)), columns) for path in files]
+    tables = [_read_table(path, columns) for path in finished]
     episodes = [value for table in tables for value in table["episode_index"].to_pylist()]
     lengths = [value for table in tables for value in table["length"].to_pylist()]
-    if len(episodes) != info["total_episodes"] or episodes != list(range(len(episodes))):
+    listed = info["total_episodes"]
+    count = next((i for i, episode in enumerate(episodes) if episode != i), len(episodes))
+    if not 0 < count <= listed or (len(episodes) >= listed and count < len(episodes)):
         raise DatasetError(
-            f"{folder}: {len(episodes)} episodes, {_short(episodes)}; expected 0 to {info['total_episodes'] - 1}, as "
-            "many as info.json's total_episodes"
+            f"{folder}: {len(episodes)} episodes, {_short(episodes)}; expected 0 to {listed - 1}, as many as "
+            "info.json's total_episodes"
         )
     whole = all(is_whole(length, 0) for length in lengths)
-    if not whole or sum(lengths) != info["total_frames"]:
+    frames = sum(lengths[:count]) if whole else 0
+    if not whole or frames > info["total_frames"] or (count == listed and frames < info["total_frames"]):
         raise DatasetError(
             f"{folder}: the episodes' lengths are {_short(lengths)}; expected whole numbers that add up to "
             f"info.json's total_frames, {info['total_frames']}"
         )
+    return IntactEpisodes(listed, count, frames, finished, files[len(finished) :])
+
+
+def _is_finished(path: Path) -> bool:
+    """Whether a parquet file has a footer, which is written last."""
+    with path.open("rb") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(-min(size, len(PARQUET_END)), os.SEEK_END)
+        return size > 2 * len(PARQUET_END) and file.read() == PARQUET_END
 
 
 def _read_table(path: Path, columns: Iterable[str] | None) -> pa.Table:

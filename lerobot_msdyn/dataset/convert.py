@@ -19,6 +19,7 @@ logger = logging.getLogger(__name__)
 
 LEGACY_VERSION = "v2.1"
 ONE_EACH_MB = 1e-9
+CONVERTING = Path("converting") / "dataset"  # in the work folder
 
 
 def converted_copy(repo_id: str, root: Path, folder: Path) -> Path:
@@ -37,7 +38,7 @@ def converted_copy(repo_id: str, root: Path, folder: Path) -> Path:
         raise DatasetError(f"{root} is a LeRobot dataset of version {version}; --convert takes {LEGACY_VERSION} only")
     check_features(info.get("features"), root / "meta" / "info.json")
     logger.info("converting a copy of %s from %s", root, LEGACY_VERSION)
-    copy = folder / "converting" / "dataset"
+    copy = folder / CONVERTING
     with writing(folder), temporary_files_in(folder):
         shutil.rmtree(copy.parent, ignore_errors=True)
         for path in sorted(root.rglob("*")):
@@ -50,7 +51,8 @@ def converted_copy(repo_id: str, root: Path, folder: Path) -> Path:
             # A file per episode: the script puts videos together whatever their codecs, and by the lengths they claim.
             convert_dataset(repo_id, root=copy, push_to_hub=False, video_file_size_in_mb=ONE_EACH_MB)
     except Exception as error:  # several libraries read the files, each with errors of its own
-        raise DatasetError(f"{root} cannot be converted by LeRobot's script ({first_line(error)})") from error
+        reason = named_as_given(first_line(error), folder, root)
+        raise DatasetError(f"{root} cannot be converted by LeRobot's script ({reason})") from error
     new = read_json(copy, "meta/info.json")
     new |= {"fps": info.get("fps"), "video_files_size_in_mb": DEFAULT_VIDEO_FILE_SIZE_IN_MB}  # it rounds fps
     with writing(folder):
@@ -58,6 +60,19 @@ def converted_copy(repo_id: str, root: Path, folder: Path) -> Path:
     copy.rename(done)
     shutil.rmtree(copy.parent)
     return done
+
+
+def named_as_given(message: str, folder: Path, root: Path) -> str:
+    """A message in which the copy in a work folder, which its reader will not find, is called by the source's name.
+
+    Args:
+        message: any text.
+        folder: the work folder.
+        root: the source.
+    """
+    for path, name in ((folder / CONVERTING, f"{root}"), (folder / CONVERTED, f"{root} (converted)")):
+        message = message.replace(str(path), name)
+    return message
 
 
 @contextlib.contextmanager

@@ -92,9 +92,13 @@ def merged(entries: Sequence[dict[str, dict[str, str]]]) -> dict[str, dict[str, 
     return together
 
 
-def write_provenance(root: Path, episodes: Sequence[Provenance], recipe_yaml: str) -> None:
-    """Write meta/msdyn/episodes.parquet (one row per episode) and the recipe that was used."""
+def write_provenance(root: Path, episodes: Sequence[Provenance], recipe_yaml: str, run: str = "") -> None:
+    """Write meta/msdyn/episodes.parquet (one row per episode) and the recipe that was used.
+
+    `run` is the digest of all that the result depends on, by which the same command knows its output again.
+    """
     common = {
+        "run": run,
         "recipe_sha256": hashlib.sha256(recipe_yaml.encode()).hexdigest(),
         "version": importlib.metadata.version("lerobot_msdyn"),
         "lerobot_version": importlib.metadata.version("lerobot"),

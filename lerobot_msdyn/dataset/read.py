@@ -2,6 +2,9 @@
 
 import io
 import itertools
+import logging
+import shutil
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,8 +26,9 @@ from lerobot_msdyn.core.config import CameraConfig
 from lerobot_msdyn.core.errors import DatasetError, EpisodeError, first_line
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.dataset.calibration import make_camera
-from lerobot_msdyn.dataset.checks import check_metadata, picture_size, read_json
+from lerobot_msdyn.dataset.checks import IntactEpisodes, check_metadata, picture_size, read_json
 from lerobot_msdyn.dataset.chroma import is_subsampled, restore_chroma
+from lerobot_msdyn.dataset.features import completed
 from lerobot_msdyn.dataset.rows import TIMESTAMP_TOLERANCE_S, on_grid, read_rows, source_file, task_of
 from lerobot_msdyn.dataset.video_index import (
     VIDEO_ERRORS,
@@ -34,6 +38,8 @@ from lerobot_msdyn.dataset.video_index import (
     frame_numbers,
     index_of,
 )
+
+logger = logging.getLogger(__name__)
 
 CODEBASE_VERSION = "v3.0"
 BLOCK_FRAMES = 128  # that are decoded at once
@@ -76,6 +82,9 @@ def open_source(
 ) -> LeRobotDatasetMetadata:
     """The metadata of a dataset in `root`, else in LeRobot's home, else on the hub. Nothing is written to `root`.
 
+    Of a dataset that a killed recorder left, it is that of the leading episodes that are there, with a warning.
+    Features lack nothing that LeRobot's trainer asks for (`features.completed`).
+
     Args:
         repo_id: the dataset's name.
         root: its folder.
@@ -93,13 +102,31 @@ def open_source(
             )
         folder = _from_hub(repo_id, folder)
     check_version(folder)
-    check_metadata(folder)
+    intact = check_metadata(folder)
     try:
-        source = Source(repo_id, folder)
-        source.tolerance_s = tolerance_s
-        return source
+        source = _without_unfinished(repo_id, folder, intact) if intact.unfinished else Source(repo_id, folder)
     except Exception as error:  # several libraries read the metadata, each with errors of its own
         raise DatasetError(f"{folder}: the dataset's meta/ cannot be read ({first_line(error)})") from error
+    if intact.count < intact.listed:
+        logger.warning("%s", intact.lost_line(folder))
+        source.info.total_episodes, source.info.total_frames = intact.count, intact.frames
+    for key, feature in source.features.items():
+        source.features[key] = completed(feature)
+    source.tolerance_s = tolerance_s
+    return source
+
+
+def _without_unfinished(repo_id: str, folder: Path, intact: IntactEpisodes) -> Source:
+    """The metadata of a dataset some of whose tables of episodes have no footer, over which LeRobot would stumble."""
+    with tempfile.TemporaryDirectory() as temporary:
+        copy = Path(temporary)
+        names = [path.relative_to(folder) for path in (folder / "meta").iterdir() if path.is_file()]
+        for name in [*names, *(path.relative_to(folder) for path in intact.files)]:
+            (copy / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(folder / name, copy / name)
+        source = Source(repo_id, copy)
+    source.root = folder
+    return source
 
 
 def _from_hub(repo_id: str, folder: Path) -> Path:

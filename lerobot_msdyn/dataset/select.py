@@ -3,6 +3,7 @@
 from lerobot.datasets import LeRobotDatasetMetadata
 
 from lerobot_msdyn.core.errors import DatasetError
+from lerobot_msdyn.dataset.checks import read_json
 
 ON_ROBOT = ("wrist", "hand", "gripper", "palm", "finger", "effector", "flange", "tool")  # in names of cameras
 
@@ -11,17 +12,28 @@ def select_episodes(meta: LeRobotDatasetMetadata, episodes: list[int] | None) ->
     """The episodes asked for, each once and in order; all of them if none are named.
 
     Raises:
-        DatasetError: an index is out of range.
+        DatasetError: an index is out of range, or of an episode that is lost.
     """
     if episodes is None:
         return list(range(meta.total_episodes))
     bad = [index for index in episodes if not 0 <= index < meta.total_episodes]
+    lost = lost_episodes(meta)
+    if any(index in lost for index in bad):
+        raise DatasetError(
+            f"{meta.repo_id}: episode {', '.join(map(str, bad))} is lost: meta/info.json lists {lost.stop} episodes, "
+            f"but only 0 to {lost.start - 1} are there; choose among these"
+        )
     if bad:
         raise DatasetError(
             f"{meta.repo_id}: no episode {', '.join(map(str, bad))}; "
             f"it has {meta.total_episodes} (0 to {meta.total_episodes - 1})"
         )
     return sorted(set(episodes))
+
+
+def lost_episodes(meta: LeRobotDatasetMetadata) -> range:
+    """Episodes that info.json lists and a killed recorder has not finished (`open_source` has warned of them)."""
+    return range(meta.total_episodes, read_json(meta.root, "meta/info.json")["total_episodes"])
 
 
 def colour_cameras(meta: LeRobotDatasetMetadata) -> list[str]:

@@ -17,6 +17,7 @@ Every file is complete or absent. A value is read back from its file also in the
 was stopped computes with the same bits as one that was not.
 """
 
+import hashlib
 import json
 import logging
 import os
@@ -29,14 +30,14 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from lerobot_msdyn.core.errors import OutputError, WorkerError
-from lerobot_msdyn.core.files import write_whole, writing
+from lerobot_msdyn.core.files import DIGEST_BYTES, write_whole, writing
 from lerobot_msdyn.core.serialise import ValueFileError, load_value, save_value
 
 logger = logging.getLogger(__name__)
 
 FINISHED = "finished"
 SCENE = "scene"
-PUBLISHED = "published.json"
+RUN, PUBLISHED = "run.json", "published.json"
 BACKGROUNDS = "backgrounds"
 CONVERTED = "converted"
 WORTH_KEEPING = (SCENE, "variant", FINISHED)  # what takes long to make of an episode
@@ -172,7 +173,7 @@ class Staging(Kept):
         Raises:
             OutputError: what is here belongs to another run; what differs is named.
         """
-        path = self.folder / "run.json"
+        path = self.folder / RUN
         if restart:
             self.clear()
         if path.exists():
@@ -191,6 +192,11 @@ class Staging(Kept):
         write_whole(self.folder / PUBLISHED, json.dumps(list(skipped)).encode())
         folder.rename(root)
         self.remove()
+
+    def run_digest(self) -> str:
+        """`digest_of_run` of the run that works here; empty where none was agreed on."""
+        path = self.folder / RUN
+        return digest_of_run(self._read(path)) if path.exists() else ""
 
     def _read(self, path: Path) -> Any:
         try:
@@ -217,12 +223,18 @@ def published_before(root: Path) -> list[str] | None:
     None where that is not so.
     """
     path = work_folder(root) / PUBLISHED
-    if not root.exists() or not path.exists() or (path.parent / "dataset").exists():
+    if not os.path.exists(root) or not path.exists() or (path.parent / "dataset").exists():
         return None
     with Staging(root) as staging:
         skipped = json.loads(path.read_text())
         staging.remove()
     return [str(line) for line in skipped]
+
+
+def digest_of_run(run: dict[str, Any]) -> str:
+    """A digest of what a result depends on (see `Staging.agree`), which shows nothing of the user's folders."""
+    content = json.dumps(run, indent=1, sort_keys=True).encode()
+    return hashlib.blake2b(content, digest_size=DIGEST_BYTES).hexdigest()
 
 
 def _how_to_go_on(changes: list[str]) -> str:

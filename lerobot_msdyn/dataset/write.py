@@ -25,7 +25,7 @@ from lerobot.datasets.video_utils import concatenate_video_files
 from lerobot_msdyn.core.errors import OutputError, first_line
 from lerobot_msdyn.core.files import DISK_FAULTS, temporary_files_in, writing
 from lerobot_msdyn.dataset.card import licence_of, write_card
-from lerobot_msdyn.dataset.checks import PICTURE_DTYPES, TEXT_DTYPES
+from lerobot_msdyn.dataset.checks import MAX_NAME, PICTURE_DTYPES, TEXT_DTYPES
 from lerobot_msdyn.dataset.copy_source import stage_copies
 from lerobot_msdyn.dataset.encode import StagedPictures, Stats, check_encoding, stage_pictures
 from lerobot_msdyn.dataset.provenance import Provenance, write_provenance, write_unseen
@@ -181,7 +181,8 @@ class OutputDataset:
         with writing(folder), temporary_files_in(self.staging.folder):
             shutil.rmtree(folder, ignore_errors=True)
             _Assembly(self.source, self.repo_id, folder, self.copies).build(episodes)
-            write_provenance(folder, [self._with_times(episode) for episode in episodes], recipe_yaml)
+            provenance = [self._with_times(episode) for episode in episodes]
+            write_provenance(folder, provenance, recipe_yaml, self.staging.run_digest())
             for number, episode in enumerate(episodes):
                 if episode.masks:
                     write_unseen(folder, number, episode.masks)
@@ -199,17 +200,33 @@ class OutputDataset:
         return replace(episode.provenance, times_replaced_s=off_s if off_s > KEPT_S else 0.0)
 
 
+def check_name(repo_id: str) -> None:
+    """Whether a dataset can have this name, which becomes a folder's.
+
+    Raises:
+        OutputError: it cannot.
+    """
+    parts = repo_id.split("/")
+    wrong = any(part.strip(".") == "" or len(part) > MAX_NAME or not part.isprintable() for part in parts)
+    if wrong or len(parts) > 2 or "\\" in repo_id:
+        raise OutputError(f"new_repo_id is {repo_id!r}; expected a name as local/desk (--new_repo_id)")
+
+
 def check_place(source_root: Path, root: Path) -> None:
     """Whether a dataset can be written to `root`.
 
     Raises:
-        OutputError: it exists already, or lies inside the source.
+        OutputError: it exists already, lies inside the source, or cannot be looked at.
     """
+    try:
+        exists = root.exists()
+    except OSError as error:
+        raise OutputError(f"{root} cannot be looked at ({error.strerror}); choose another --new_root") from error
     if root.resolve().is_relative_to(source_root.resolve()):
         raise OutputError(
             f"{root} lies inside the source {source_root}, which is never written to; choose another --new_root"
         )
-    if root.exists():
+    if exists:
         raise OutputError(f"{root} exists already; remove it or choose another --new_repo_id or --new_root")
 
 

@@ -22,6 +22,10 @@ from lerobot_msdyn.views.coverage import Coverage, coverage_of
 from lerobot_msdyn.views.expected_error import Expected, expected_error
 
 HEAT_WIDTH = 24  # columns of the map of what is uncovered
+SHARPNESS_FLOOR = 0.25 / 255**2  # variance of the Laplacian (brightness 0..1) of a picture without any detail
+FLICKER_FLOOR = 0.25 / 255  # difference of frames (0..1) that no 8-bit picture shows
+MAX_RATIO = 100.0  # of a score to the video's own
+SHOWS_NOTHING = 0.01  # of the sharpest judged frame's sharpness
 CAUSES = {
     "video": "the scene does not match its own video (too few steps, wrong masks or motion)",
     "geometry": "the scene does not stand where the depth says (wrong masks, motion or depth)",
@@ -69,6 +73,7 @@ def judge(windows: Sequence[FittedWindow], camera: CameraTrack) -> Scores:
     frames: list[FrameScores] = []
     expected: list[Expected] = []
     uncovered, new_flicker, recorded_flicker = [], 0.0, 0.0
+    sharp: list[tuple[float, float]] = []  # rendered and recorded, by frame
     moving = MovingPixels()
     for window in windows:
         check = window.self_check
@@ -86,11 +91,17 @@ def judge(windows: Sequence[FittedWindow], camera: CameraTrack) -> Scores:
         expected.append(error)
         uncovered += [coverage.unseen for coverage in coverages]
         for i, (frame, coverage) in enumerate(zip(check.frames.tolist(), coverages, strict=True)):
-            ratio = sharpness(pictures[i : i + 1]) / max(sharpness(check.recorded[i : i + 1]), 1e-9)
+            sharp.append((sharpness(pictures[i : i + 1]), sharpness(check.recorded[i : i + 1])))
             covered = ~coverage.unseen
             angle = float(coverage.angle_deg[covered].mean()) if covered.any() else 180.0
             frames.append(
-                FrameScores(frame + window.start, decibels(float(error.total[i])), coverage.unseen_share, angle, ratio)
+                FrameScores(
+                    frame + window.start,
+                    decibels(float(error.total[i])),
+                    coverage.unseen_share,
+                    angle,
+                    ratio(*sharp[-1]),
+                )
             )
     total = Expected(**{name: torch.cat([getattr(part, name) for part in expected]) for name in vars(expected[0])})
     checks = [window.self_check for window in windows]
@@ -108,11 +119,22 @@ def judge(windows: Sequence[FittedWindow], camera: CameraTrack) -> Scores:
         float(np.mean([frame.unseen for frame in frames])),
         float(np.mean([frame.angle_deg for frame in frames])),
         float(np.mean([check.track_px for check in checks])),
-        new_flicker / recorded_flicker if recorded_flicker > 0 else 1.0,
-        float(np.mean([frame.sharpness_ratio for frame in frames])),
+        ratio(new_flicker, recorded_flicker, FLICKER_FLOOR * len(frames)),
+        sharpness_ratio(sharp),
         frames,
         _heat(np.mean(uncovered, axis=0)),
     )
+
+
+def ratio(new: float, recorded: float, floor: float = SHARPNESS_FLOOR) -> float:
+    """A measure of the new view relative to the video's; what is under `floor` in both is alike, nothing explodes."""
+    return min(max(new, floor) / max(recorded, floor), MAX_RATIO)
+
+
+def sharpness_ratio(sharp: Sequence[tuple[float, float]]) -> float:
+    """Mean over frames, without those whose recorded picture is far less sharp than the sharpest: they show nothing."""
+    sharpest = max(recorded for _, recorded in sharp)
+    return float(np.mean([ratio(*pair) for pair in sharp if pair[1] >= SHOWS_NOTHING * sharpest]))
 
 
 def reasons(scores: Scores, config: GateConfig) -> list[str]:

@@ -137,6 +137,14 @@ def test_a_truncated_video_costs_its_episode_only(
     output = LeRobotDataset("local/desk_msdyn", root=tmp_path / "new", video_backend="pyav")
     assert output.num_episodes == 2
     assert np.isfinite([float(output[i][FRONT].mean()) for i in range(len(output))]).all()
+    before = content(tmp_path / "new")
+    assert run(*arguments, "--variants", "1", *FAST) == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith(f"finished before: written to {tmp_path / 'new'}")
+    assert "local/desk episode 1, observation.images.front" in (tmp_path / "new" / "report.html").read_text()
+    assert run(*arguments, "--variants", "2", *FAST) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert content(tmp_path / "new") == before
 
 
 @pytest.fixture
@@ -172,6 +180,65 @@ def test_a_fault_in_one_episode_does_not_cost_the_others(
     assert run(*arguments, "--episodes", "[0,1]", "--cameras", "[front]", "--variants", "1", *FAST) == 1
     assert "skipped: local/desk episode 0: RuntimeError: a fault" in capsys.readouterr().out
     assert LeRobotDataset("local/desk_msdyn", root=tmp_path / "new", video_backend="pyav").num_episodes == 2
+
+
+def test_one_absent_file_is_one_line(desk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = tmp_path / "broken"
+    shutil.copytree(desk, root)
+    shutil.rmtree(root / "videos" / SIDE)
+    arguments = ["--repo", "local/desk", "--root", str(root), "--new_root", str(tmp_path / "new")]
+    assert run(*arguments, "--cameras", "[front]", *FAST) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if "is absent" in line]
+    assert len(lines) == 2, lines
+    assert lines[0].startswith("ERROR skipped: local/desk episode 0")
+    assert "First: local/desk episodes 0 to 2: " in lines[1]
+
+
+def copies_only(source: Any, index: int, *_: Any) -> list[Any]:
+    """In place of `augment_episode`: the recorded episode alone."""
+    from lerobot_msdyn.dataset.provenance import SOURCE_VARIANT, Provenance
+    from lerobot_msdyn.dataset.write import NewEpisode
+
+    return [NewEpisode(index, Provenance(source.repo_id, index, SOURCE_VARIANT, 0))]
+
+
+def test_what_a_killed_recorder_left(
+    desk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from lerobot_msdyn.augment import run as job
+
+    monkeypatch.setattr(job, "augment_episode", copies_only)
+    root = tmp_path / "killed"
+    shutil.copytree(desk, root)
+    info = root / "meta" / "info.json"
+    info.write_text(json.dumps(json.loads(info.read_text()) | {"total_episodes": 105, "total_frames": 5000}))
+    arguments = ["--repo", "local/killed", "--root", str(root), "--scene.shared_background", "false"]
+    assert run(*arguments, "--new_root", str(tmp_path / "new")) == 1
+    printed = capsys.readouterr()
+    assert "skipped: local/killed episodes 3 to 104: lost" in printed.out
+    assert LeRobotDataset("local/new", root=tmp_path / "new", video_backend="pyav").num_episodes == 3
+    assert run(*arguments, "--new_root", str(tmp_path / "some"), "--episodes", "[0,2]") == 0
+    assert run(*arguments, "--new_root", str(tmp_path / "none"), "--episodes", "[50]") == 2
+    assert "episode 50 is lost" in capsys.readouterr().err
+
+
+def test_what_can_be_checked_first_is_checked_first(
+    desk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from lerobot_msdyn.augment import cost
+    from lerobot_msdyn.augment import run as job
+
+    def begun(*_: Any) -> None:
+        raise AssertionError("the work has begun")
+
+    monkeypatch.setattr(job, "augment_episode", begun)
+    monkeypatch.setattr(cost.shutil, "disk_usage", lambda folder: shutil._ntuple_diskusage(10, 10, 0))
+    arguments = ["--repo", "local/desk", "--root", str(desk)]
+    assert run(*arguments, "--new_root", str(tmp_path / "new")) == 2
+    assert f"{tmp_path} has 0 MB of free disk; the output takes about" in capsys.readouterr().err
+    assert run(*arguments, "--new_repo_id", "local/../../up") == 2
+    assert "expected a name as local/desk" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
 
 
 def content(root: Path) -> dict[Path, bytes]:

@@ -9,7 +9,7 @@ import torch
 
 from lerobot_msdyn.core.errors import DatasetError
 from lerobot_msdyn.dataset import convert
-from lerobot_msdyn.dataset.convert import converted_copy
+from lerobot_msdyn.dataset.convert import converted_copy, named_as_given
 from lerobot_msdyn.dataset.read import open_source, read_colour
 from lerobot_msdyn.dataset.rows import read_rows
 from lerobot_msdyn.dataset.select import colour_cameras
@@ -33,6 +33,20 @@ def test_what_cannot_be_converted(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="cannot be converted by LeRobot's script"):
         converted_copy("local/c", legacy(tmp_path / "c"), tmp_path / "work")
     assert not (tmp_path / "work" / "converted").exists()
+
+
+def test_messages_name_the_files_of_the_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root, work = legacy(tmp_path / "a"), tmp_path / "work"
+
+    def fails(repo_id: str, root: Path, push_to_hub: bool) -> None:
+        raise FileNotFoundError(f"no {root / 'data' / 'chunk-000' / 'episode_000003.parquet'}")
+
+    monkeypatch.setattr(convert, "convert_dataset", fails)
+    with pytest.raises(DatasetError) as caught:
+        converted_copy("local/a", root, work)
+    assert f"no {root}/data/chunk-000/episode_000003.parquet" in str(caught.value)
+    assert str(work) not in str(caught.value)
+    assert named_as_given(f"{work}/converted/meta is absent", work, root) == f"{root} (converted)/meta is absent"
 
 
 def test_a_link_out_of_the_source_is_not_followed(tmp_path: Path) -> None:

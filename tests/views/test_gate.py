@@ -22,7 +22,7 @@ from lerobot_msdyn.reconstruction.self_check import (
 )
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.views.expected_error import expected_error
-from lerobot_msdyn.views.gate import Scores, judge, reasons, record
+from lerobot_msdyn.views.gate import MAX_RATIO, Scores, judge, ratio, reasons, record, sharpness_ratio
 from lerobot_msdyn.views.offsets import orbit_offset
 
 FRAMES, WIDTH, HEIGHT = 30, 64, 48
@@ -153,6 +153,20 @@ def test_errors_by_cause_add_up(scene: Reconstruction) -> None:
 
 def test_what_stands_still_does_not_flicker_more_than_in_the_video(scene: Reconstruction) -> None:
     assert score(scene, 5).flicker_ratio <= 1
+
+
+def test_ratios_cannot_explode(scene: Reconstruction) -> None:
+    assert ratio(0.1, 0.0) == ratio(1e9, 1e-9) == MAX_RATIO
+    assert ratio(0.0, 0.0) == 1
+    assert ratio(0.02, 0.04) == pytest.approx(0.5)
+    assert sharpness_ratio([(0.1, 0.1), (0.1, 1e-9), (0.02, 0.1)]) == pytest.approx(0.6)
+    (window,) = scene.windows
+    recorded = window.self_check.recorded.clone()
+    recorded[0] = 0
+    blank = dataclasses.replace(window, self_check=dataclasses.replace(window.self_check, recorded=recorded))
+    scores = judge([blank], scene.camera)
+    assert scores.sharpness_ratio == pytest.approx(score(scene, 0).sharpness_ratio, rel=0.5)
+    assert all(frame.sharpness_ratio <= MAX_RATIO for frame in scores.frames)
 
 
 def test_measures() -> None:

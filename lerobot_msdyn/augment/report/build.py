@@ -39,6 +39,7 @@ def write_report(
     name: str,
     episodes: Sequence[NewEpisode],
     skipped: Sequence[str],
+    skipped_episodes: int,
     seconds: float,
 ) -> Path:
     """Write the report of a dataset that was just written; returns its path.
@@ -48,7 +49,8 @@ def write_report(
         root: folder of the new dataset.
         name: its name in the page.
         episodes: all of a run in order, the dropped ones among them.
-        skipped: why source episodes were left out, one line each.
+        skipped: why source episodes were left out, one line per reason.
+        skipped_episodes: how many were.
         seconds: what the run took.
     """
     entries, places = entries_of(episodes)
@@ -57,7 +59,9 @@ def write_report(
         entry = entries[i]
         entries[i] = replace(entry, pictures=_pictures(source, output, places[i], entry))
     path = root / NAME
-    path.write_text(page(name, _figures(episodes, entries, skipped, seconds), entries, skipped), encoding="utf-8")
+    path.write_text(
+        page(name, _figures(episodes, entries, skipped_episodes, seconds), entries, skipped), encoding="utf-8"
+    )
     return path
 
 
@@ -109,7 +113,7 @@ def _pictures(source: LeRobotDatasetMetadata, output: LeRobotDatasetMetadata, in
 
 
 def _figures(
-    episodes: Sequence[NewEpisode], entries: Sequence[ViewEntry], skipped: Sequence[str], seconds: float
+    episodes: Sequence[NewEpisode], entries: Sequence[ViewEntry], skipped_episodes: int, seconds: float
 ) -> dict[str, str]:
     """What the page says at its top."""
     made = [episode for episode in episodes if episode.provenance.variant != SOURCE_VARIANT]
@@ -120,7 +124,7 @@ def _figures(
     return {
         "new episodes": str(sum(not episode.dropped for episode in made)),
         "dropped by the gate": str(sum(bool(episode.dropped) for episode in made)),
-        "source episodes skipped": str(len(skipped)),
+        "source episodes skipped": str(skipped_episodes),
         "samples rejected": str(sum(len(episode.provenance.gate["rejected"]) for episode in made)),
         "expected quality, median": f"{np.median(scores):.1f} dB" if scores else "not judged",
         "all in all": _time(seconds),

@@ -85,7 +85,7 @@ class ViewEntry:
     variant: int
     camera: str
     amounts: dict[str, float]  # the change of view
-    view: dict[str, Any]  # camera_from_source, distance_m, what_moves, and scores if it was judged
+    view: dict[str, Any]  # camera_from_source, distance_m, what_moves, defects, and scores if it was judged
     rejected: list[str]  # reasons of the samples before
     dropped: bool
     pictures: Pictures | None = None
@@ -103,13 +103,20 @@ def page(title: str, figures: dict[str, str], entries: Sequence[ViewEntry], skip
         title: name of the dataset.
         figures: what to say at the top, by name.
         entries: all views; those with pictures are shown at length.
-        skipped: why source episodes were left out, one line each.
+        skipped: why source episodes were left out, one line per reason.
     """
     shown = [entry for entry in entries if entry.pictures is not None or entry.dropped]
     top = "".join(f"<div><b>{text(value)}</b>{text(name)}</div>" for name, value in figures.items())
     left_out = ""
     if skipped:
         left_out = "<h2>Skipped episodes</h2>" + bullets(skipped)
+    noted = dict.fromkeys(
+        f"episode {entry.episode}, {entry.camera}: {line}"
+        for entry in entries
+        for line in entry.view.get("defects", [])
+    )
+    if noted:
+        left_out += "<h2>Recorded pictures</h2>" + bullets(list(noted)[:LISTED])
     moves = bullets(f"{camera}: {account_sentence(account)}" for camera, account in accounts_of(entries).items())
     more = len(entries) - min(len(entries), LISTED)
     rest = f"<p class=soft>{more} more are in meta/msdyn/episodes.parquet.</p>" if more else ""
