@@ -261,13 +261,11 @@ class _RowFiles:
 
     def add(self, rows: pa.Table) -> tuple[int, int]:
         """Append an episode; returns the chunk and file index of where it went."""
-        full = self._writer is not None and (
-            self._path.stat().st_size > self._meta.data_files_size_in_mb * MEGABYTE
-            or not rows.schema.equals(self._writer.schema)  # the source's files may differ in their types
-        )
-        if full:
-            self._writer.close()
-            self._writer = None
+        if self._writer is not None:
+            full = self._path.stat().st_size > self._meta.data_files_size_in_mb * MEGABYTE
+            if full or not rows.schema.equals(self._writer.schema):  # the source's files may differ in their types
+                self._writer.close()
+                self._writer = None
         if self._writer is None:
             self._place = self._files.take()
             chunk, file = self._place
