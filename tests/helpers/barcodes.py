@@ -53,7 +53,9 @@ def _episodes(lengths: Sequence[int]) -> list[list[int]]:
 @cache
 def _recorded(lengths: tuple[int, ...], cameras: tuple[str, ...], codec: str) -> tempfile.TemporaryDirectory:
     folder = tempfile.TemporaryDirectory()
-    features = {key: {"dtype": "video", "shape": (HEIGHT, WIDTH, 3), "names": None} for key in cameras}
+    features: dict[str, dict[str, Any]] = {
+        key: {"dtype": "video", "shape": (HEIGHT, WIDTH, 3), "names": None} for key in cameras
+    }
     features |= {"action": {"dtype": "float32", "shape": (1,), "names": None}}
     Path(folder.name).rmdir()  # LeRobot makes it
     encoder = RGBEncoderConfig(vcodec=codec)
