@@ -83,7 +83,8 @@ def _attempts(work: Work, episodes: list[int]) -> Generator[str | None]:
             yield attempt(work, index)
         return
     logger.info("%d episodes at once (--workers)", count)
-    with Workers(count, work) as workers:
+    workers = Workers(count, work)
+    with workers:
         _ = replace(work, run=workers.moving).backgrounds  # before they are asked for by all at once
         yield from workers.map(attempt, episodes)
 

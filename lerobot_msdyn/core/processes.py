@@ -19,7 +19,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from typing import Any, Self
+from typing import Any
 
 from lerobot_msdyn.core.errors import MsdynError, WorkerError, first_line
 
@@ -47,7 +47,7 @@ class Processes[S]:
         self._workers: dict[Connection, BaseProcess] = {}
         self._idle: list[Connection] = []
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "Processes[S]":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:

@@ -169,7 +169,7 @@ def test_all_processes_end_where_one_is_killed(desk: Path, tmp_path: Path, kille
     with log.open("w") as stream:
         started = [sys.executable, "-m", "lerobot_msdyn.augment", *flags]
         run = subprocess.Popen(started, stdout=stream, stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 300
     while len(list((tmp_path / ".new.partial" / "episodes").glob("*/copied.safetensors"))) < 2:
         assert time.monotonic() < deadline
         assert run.poll() is None
