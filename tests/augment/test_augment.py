@@ -190,7 +190,7 @@ def test_one_absent_file_is_one_line(desk: Path, tmp_path: Path, capsys: pytest.
     assert run(*arguments, "--cameras", "[front]", *FAST) == 2
     lines = [line for line in capsys.readouterr().err.splitlines() if "is absent" in line]
     assert len(lines) == 2, lines
-    assert lines[0].startswith("ERROR skipped: local/desk episode 0")
+    assert "skipped: local/desk episode 0: " in lines[0]
     assert "First: local/desk episodes 0 to 2: " in lines[1]
 
 

@@ -60,13 +60,13 @@ def on_the_arm(desk: Path, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Episode 0 of `desk` cannot be read, and all cameras move with the robot; the episodes that were asked for."""
     asked: list[int] = []
 
-    def read(source: LeRobotDatasetMetadata, index: int, *rest: object, **more: object) -> Episode:
+    def read(source: LeRobotDatasetMetadata, index: int, *rest: object, **more: object) -> tuple[Episode, dict]:
         asked.append(index)
         if index == 0:
             raise EpisodeError("local/desk episode 0: it is damaged")
-        return episode(stop_and_go().round(), stop_and_go()[:, None])
+        return episode(stop_and_go().round(), stop_and_go()[:, None]), {}
 
-    monkeypatch.setattr(moving_cameras, "read_episode", read)
+    monkeypatch.setattr(moving_cameras, "read_recorded", read)
     return asked
 
 

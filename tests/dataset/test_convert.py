@@ -38,7 +38,7 @@ def test_what_cannot_be_converted(tmp_path: Path) -> None:
 def test_messages_name_the_files_of_the_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     root, work = legacy(tmp_path / "a"), tmp_path / "work"
 
-    def fails(repo_id: str, root: Path, push_to_hub: bool) -> None:
+    def fails(repo_id: str, root: Path, **_: object) -> None:
         raise FileNotFoundError(f"no {root / 'data' / 'chunk-000' / 'episode_000003.parquet'}")
 
     monkeypatch.setattr(convert, "convert_dataset", fails)

@@ -133,5 +133,5 @@ def _figures(
     }
 
 
-def _time(seconds: float) -> str:
+def _time(seconds: int | float) -> str:
     return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.1f} min"
