@@ -2,7 +2,7 @@
 
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import pytest
@@ -11,12 +11,20 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as commands do, before torch is loaded
 
 from lerobot_msdyn.augment import __main__ as augment
+from lerobot_msdyn.dataset.video import ordinary_priority
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.dataset import write_dataset
 
 logging.getLogger("lerobot").setLevel(logging.WARNING)
 
 FRAMES, WIDTH, HEIGHT = 12, 64, 48
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol() -> Generator[None, object, object]:
+    """LeRobot's tools encode AV1 in this process; what root's encoder does to it must not reach the next test."""
+    with ordinary_priority():
+        return (yield)
 
 
 def _scenes(episodes: int) -> list:

@@ -51,14 +51,14 @@ def first_speeds(source: LeRobotDatasetMetadata, episodes: Sequence[int], camera
         EpisodeError: none of them can; the first one's reason.
         PriorError: a prior was demanded and cannot be had.
     """
-    first: EpisodeError | None = None
+    errors = []
     for index in episodes:
         try:
             return measure_speeds(source, index, cameras, recipe)
         except EpisodeError as error:
             logger.warning("not measured: %s", error)
-            first = first or error
-    raise first or EpisodeError(f"{source.repo_id}: no episode to measure")
+            errors.append(error)
+    raise errors[0]
 
 
 def measure_speeds(source: LeRobotDatasetMetadata, index: int, cameras: list[str], recipe: Recipe) -> Speeds:

@@ -39,19 +39,32 @@ def quiet_encoders() -> None:
 
 @contextlib.contextmanager
 def tamed_av1() -> Iterator[None]:
-    """An AV1 encoder that is opened here logs nothing but errors, and runs at ordinary priority.
+    """An AV1 encoder that is opened here logs nothing but errors, unless the user has set SVT_LOG.
 
-    Where root runs it, SVT-AV1 makes its own threads and the one that opens it real-time threads of the highest
-    priority, for good: they starve the rest of the machine, and where they wait for each other, themselves. `SVT_LOG`
-    is left as it is where the user has set it.
+    It runs at `ordinary_priority` besides.
     """
-    before, quiet = _real_time_threads(), SVT_LOG not in os.environ
+    quiet = SVT_LOG not in os.environ
     os.environ.setdefault(SVT_LOG, SVT_ERRORS)
     try:
-        yield
+        with ordinary_priority():
+            yield
     finally:
         if quiet:
             os.environ.pop(SVT_LOG, None)
+
+
+@contextlib.contextmanager
+def ordinary_priority() -> Iterator[None]:
+    """No thread of this process is left in real time by what is done here.
+
+    Where root runs it, SVT-AV1 makes its own threads and the one that opens it real-time threads of the highest
+    priority, for good: they starve the rest of the machine, and where they wait for each other, themselves. Processes
+    that are started later inherit it.
+    """
+    before = _real_time_threads()
+    try:
+        yield
+    finally:
         for thread in _real_time_threads() - before:
             with contextlib.suppress(OSError):  # it has ended
                 os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))

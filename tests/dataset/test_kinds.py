@@ -22,7 +22,6 @@ from lerobot_msdyn.dataset.encode import encode_image
 from lerobot_msdyn.dataset.provenance import SOURCE_VARIANT, Provenance
 from lerobot_msdyn.dataset.read import open_source, read_colour, read_episode
 from lerobot_msdyn.dataset.rows import read_rows
-from lerobot_msdyn.dataset.video import tamed_av1
 from lerobot_msdyn.dataset.write import NewEpisode, OutputDataset
 
 FRONT, SIDE = "observation.images.front", "observation.images.side"
@@ -70,8 +69,7 @@ def record(root: Path, dtype: str, sizes: dict[str, tuple[int, int]], fps: int =
                 low = rng.integers(0, 255, (3, 4, 3)).astype(np.uint8)
                 frame[key] = cv2.resize(low, (width, height), interpolation=cv2.INTER_CUBIC)
             dataset.add_frame(frame)
-        with tamed_av1():
-            dataset.save_episode(parallel_encoding=False)
+        dataset.save_episode(parallel_encoding=False)
     dataset.finalize()
 
 
