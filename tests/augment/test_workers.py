@@ -165,7 +165,7 @@ def test_a_run_goes_on_only_with_the_plugin_that_it_began_with(
 @pytest.mark.parametrize("killed", ["parent", "worker"])
 def test_all_processes_end_where_one_is_killed(desk: Path, tmp_path: Path, killed: str) -> None:
     out, log = tmp_path / "new", tmp_path / "log"
-    flags = command(desk, out, "--workers", "2", "--fit.steps", "5000")
+    flags = command(desk, out, "--workers", "2", "--fit.steps", "5000", "--scene.shared_background", "false")
     with log.open("w") as stream:
         started = [sys.executable, "-m", "lerobot_msdyn.augment", *flags]
         run = subprocess.Popen(started, stdout=stream, stderr=subprocess.PIPE, text=True)
