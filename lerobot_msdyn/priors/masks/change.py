@@ -11,10 +11,10 @@ _TEXTURE_NOISE = 2.0  # Lab units; flatter than this, a window has no texture
 _DARK = 8.0  # grey levels, added to both sides of a ratio
 _EVEN_WINDOW = 5  # px, over which the ratio of brightness should be even
 _MOST = 6.0  # log-odds; no pixel is surer than this
-# Log-odds of "another thing" against "the same, perhaps in the shadow", by logistic regression on true masks of
-# simulated and of ray-cast videos (AV1): weights of the features of `Reference.features`, in their order.
-_WEIGHTS = (0.74, 1.42, 0.83, -5.54, 2.11, 2.33)
-_BIAS = -1.09
+# Log-odds of "another thing" against "the same, perhaps in the shadow", by logistic regression on true masks
+# (benchmarks/tune_masks.py): weights of the features of `Reference.features`, in their order.
+_WEIGHTS = (0.27, 1.05, 1.47, -2.33, 2.53, 0.27)
+_BIAS = -1.78
 
 _GUIDE_WINDOW = 9  # px
 _GUIDE_NOISE = 60.0  # grey levels²; weaker edges of the picture do not hold the outline
