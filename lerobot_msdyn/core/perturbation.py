@@ -24,12 +24,14 @@ if TYPE_CHECKING:
     from lerobot_msdyn.core.cameras import CameraTrack
 
 AMOUNTS = (
-    "azimuth_deg",  # about the point that the camera looks at, to its right
-    "elevation_deg",  # about the same point, up
+    "azimuth_deg",  # about the vertical through the point that the camera looks at, to its right
+    "elevation_deg",  # about the horizontal through the same point, up
     *("shift_x", "shift_y", "shift_z"),  # m, along the camera's axes (OpenCV: right, down, ahead)
     *("turn_x_deg", "turn_y_deg", "turn_z_deg"),  # about the camera's axes
+    *("pan_deg", "tilt_deg"),  # in place: about the vertical, to the right; about the horizontal, up
     "log_zoom",  # logarithm of a factor of the focal length
 )
+LEVEL = (0.0, -1.0, 0.0)  # the vertical in the axes of a camera that looks straight ahead, unrolled (OpenCV)
 PERTURBATIONS: Registry[type["Perturbation"]] = Registry("perturbation", "lerobot_msdyn.views.perturbations")
 
 
@@ -40,6 +42,7 @@ class Viewpoint:
     camera: "CameraTrack"
     distance: int | float  # m, to the point that it looks at
     metric: bool  # whether metres are true ones
+    up: tuple[float, float, float] = LEVEL  # the vertical in the camera's axes
     other: "Tensor | None" = None  # [4,4], world from the camera that `Perturbation.needs_pose_of` names
 
     def shifts(self, metres: int | float, relative: int | float, axes: str = "xyz") -> dict[str, int | float]:

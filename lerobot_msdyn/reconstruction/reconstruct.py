@@ -30,6 +30,7 @@ from lerobot_msdyn.reconstruction.prune import without_contradicted
 from lerobot_msdyn.reconstruction.result import FittedWindow, Reconstruction
 from lerobot_msdyn.reconstruction.self_check import SelfCheck, self_check
 from lerobot_msdyn.reconstruction.share_background import moving_in_few, share_backgrounds
+from lerobot_msdyn.reconstruction.upright import up_of
 from lerobot_msdyn.reconstruction.windows import windows
 from lerobot_msdyn.render.cpu.threads import torch_on_one_thread
 from lerobot_msdyn.render.devices import chosen_device
@@ -57,6 +58,7 @@ class Draft:
     priors: Priors = field(init=False)
     empty: EmptyScene = field(init=False)
     distance: float = field(init=False)  # m, to the look-at point
+    up: tuple[float, float, float] = field(init=False)  # the vertical in the camera's axes
     scene: DynamicScene = field(init=False)
     fitted: FitResult = field(init=False)
     evidence: Evidence = field(init=False)
@@ -85,10 +87,11 @@ def _priors(draft: Draft) -> None:
 
 
 def _background(draft: Draft) -> None:
-    """What the camera sees where nothing moves."""
+    """What the camera sees where nothing moves, and how it stands to it."""
     empty = empty_scene(draft.view.rgb, draft.priors.depth, draft.priors.instances)
     draft.empty = empty if draft.shared is None else completed(empty, draft.shared.empty, len(draft.view))
     draft.distance = look_at_distance(draft.empty.depth)
+    draft.up = up_of(draft.empty.depth, draft.view.camera.intrinsics[0], draft.recipe.camera.tilt_deg)
 
 
 def _initial_scene(draft: Draft) -> None:
@@ -211,7 +214,7 @@ def reconstruct(
     beside = [[window.shrunk(recipe.fit.max_width) for _, window in windows(other, recipe)] for other in others]
     device = chosen_device(recipe.device)
     fitted: list[FittedWindow] = []
-    metric, provenance, distances = [], [], []
+    metric, provenance, distances, ups = [], [], [], []
     for number, (start, window) in enumerate(parts):
         estimate = functools.partial(
             estimate_priors,
@@ -237,6 +240,7 @@ def reconstruct(
         metric.append(draft.priors.metric)
         provenance.append(draft.priors.provenance)
         distances.append(draft.distance)
+        ups.append(draft.up)
     camera = concatenated([window.evidence.camera for window in fitted])
     return Reconstruction(
         windows=tuple(fitted),
@@ -244,6 +248,7 @@ def reconstruct(
         provenance=merged(provenance),
         camera=camera.resized(view.camera.width, view.camera.height),
         distance=distances[0],
+        up=ups[0],
     )
 
 

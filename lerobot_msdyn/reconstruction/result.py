@@ -37,6 +37,7 @@ class Reconstruction:
     provenance: dict[str, dict[str, str]]  # prior -> provider, why, model and licence, of all windows
     camera: CameraTrack  # at the size of the recorded video
     distance: float  # m, to the look-at point
+    up: tuple[float, float, float]  # the vertical in the axes of the camera at the first frame
 
     @property
     def seconds(self) -> dict[str, float]:
@@ -72,4 +73,4 @@ class Reconstruction:
         """What of it is kept for later views."""
         scenes = tuple(window.scene for window in self.windows)
         starts = tuple(window.start for window in self.windows)
-        return SavedScene(source, scenes, starts, self.camera, self.metric, self.distance, self.provenance)
+        return SavedScene(source, scenes, starts, self.camera, self.metric, self.distance, self.provenance, self.up)

@@ -16,6 +16,7 @@ from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.config import RIVAL_LEVELS
 from lerobot_msdyn.core.errors import ConfigError, MsdynError
 from lerobot_msdyn.core.files import writing
+from lerobot_msdyn.core.perturbation import LEVEL
 from lerobot_msdyn.core.serialise import from_named_tensors, named_tensors, read_tensors, write_tensors
 from lerobot_msdyn.motion.model.bases import MotionLevel
 from lerobot_msdyn.motion.spec import level_spec
@@ -52,6 +53,7 @@ class SavedScene:
     metric: bool  # whether depth is in true metres
     distance: float  # m, to the look-at point
     priors: Mapping[str, Mapping[str, str]]  # prior -> provider, why, model and licence
+    up: tuple[float, float, float] = LEVEL  # the vertical in the axes of the camera at the first frame
 
     def __len__(self) -> int:
         return len(self.camera)
@@ -89,6 +91,7 @@ def save(scene: SavedScene, root: Path) -> Path:
         "camera_origin": scene.camera.origin,
         "metric": scene.metric,
         "distance_m": scene.distance,
+        "up": list(scene.up),
         "priors": scene.priors,
     }
     with writing(folder):
@@ -127,6 +130,7 @@ def load(folder: Path) -> SavedScene:
             metric=header["metric"],
             distance=header["distance_m"],
             priors=header["priors"],
+            up=tuple(header.get("up", SavedScene.up)),  # scenes of earlier versions do not say
         )
     except (OSError, KeyError, TypeError, SafetensorError) as error:
         raise MsdynError(

@@ -39,11 +39,15 @@ class CameraChange:
         if self.moves_rig and share_a_world(self.views):
             first = next(iter(self.views))
             reference = self.views[first].camera.world_from_camera
-            body = reference @ offsets(amounts[first], self.views[first].distance) @ invert_se3(reference)
+            body = (
+                reference
+                @ offsets(amounts[first], self.views[first].distance, self.views[first].up)
+                @ invert_se3(reference)
+            )
             poses = {key: body @ camera.world_from_camera for key, camera in zoomed.items()}
         else:
             poses = {
-                key: camera.world_from_camera @ offsets(amounts[key], self.views[key].distance)
+                key: camera.world_from_camera @ offsets(amounts[key], self.views[key].distance, self.views[key].up)
                 for key, camera in zoomed.items()
             }
         return {key: replace(camera, world_from_camera=poses[key]) for key, camera in zoomed.items()}
@@ -80,7 +84,9 @@ def sample_change(
         ConfigError: that pose is missing, or a kind of the user's own is not as it must be.
     """
     check_pose(perturbation, other)
-    views = {key: Viewpoint(scene.camera, scene.distance, scene.metric, other) for key, scene in scenes.items()}
+    views = {
+        key: Viewpoint(scene.camera, scene.distance, scene.metric, scene.up, other) for key, scene in scenes.items()
+    }
     frames = min((len(view.camera) for view in views.values()), default=1)
     points = _points([seed, episode, attempt], variant, 1)
     if perturbation.per_frame:

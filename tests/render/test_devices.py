@@ -12,6 +12,7 @@ from torch import Tensor
 from lerobot_msdyn.core.cameras import intrinsics_from_fov, static_camera
 from lerobot_msdyn.core.config import FitConfig
 from lerobot_msdyn.core.observations import DepthTraits, View
+from lerobot_msdyn.core.perturbation import LEVEL
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.motion.model.bases import level_from_motions
 from lerobot_msdyn.priors import PointTracks, Priors
@@ -104,7 +105,7 @@ def test_what_is_made_of_a_fit(gpu: FakeGpu) -> None:
         result = replace(result, scene=replace(result.scene, overlay=overlay))
         host = to_device((result.scene, seen), "cpu")
         window = FittedWindow(0, *host, check, STEPS, 0.0, {})
-        scene = Reconstruction((window,), True, {}, view.camera, 1.0)
+        scene = Reconstruction((window,), True, {}, view.camera, 1.0, LEVEL)
         ready = on_device(scene, GPU)
         gpu.waits.clear()
         gpu.copies.clear()

@@ -76,12 +76,12 @@ def test_with_per_frame_every_frame_has_its_own_sample() -> None:
 @pytest.mark.parametrize(
     ("config", "bounds"),
     [
-        (Orbit(azimuth_deg=4.0, elevation_deg=2.0, translation_m=0.1), [4, 2, 0.1, 0.1, 0.1, 0, 0, 0, 0]),
-        (Translation(translation_m=0.1), [0, 0, 0.1, 0.1, 0.1, 0, 0, 0, 0]),
-        (Rotation(pan_deg=1.0, tilt_deg=2.0, roll_deg=3.0), [0, 0, 0, 0, 0, 2, 1, 3, 0]),
-        (Dolly(translation_m=0.1), [0, 0, 0, 0, 0.1, 0, 0, 0, 0]),
-        (Focal(zoom=0.2), [0, 0, 0, 0, 0, 0, 0, 0, math.log(1.2)]),
-        (Drift(azimuth_deg=4.0, elevation_deg=2.0, translation_m=0.1), [4, 2, 0.1, 0.1, 0.1, 0, 0, 0, 0]),
+        (Orbit(azimuth_deg=4.0, elevation_deg=2.0, translation_m=0.1), [4, 2, 0.1, 0.1, 0.1, 0, 0, 0, 0, 0, 0]),
+        (Translation(translation_m=0.1), [0, 0, 0.1, 0.1, 0.1, 0, 0, 0, 0, 0, 0]),
+        (Rotation(pan_deg=1.0, tilt_deg=2.0, roll_deg=3.0), [0, 0, 0, 0, 0, 0, 0, 3, 1, 2, 0]),
+        (Dolly(translation_m=0.1), [0, 0, 0, 0, 0.1, 0, 0, 0, 0, 0, 0]),
+        (Focal(zoom=0.2), [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, math.log(1.2)]),
+        (Drift(azimuth_deg=4.0, elevation_deg=2.0, translation_m=0.1), [4, 2, 0.1, 0.1, 0.1, 0, 0, 0, 0, 0, 0]),
     ],
     ids=lambda value: type(value).__name__,
 )
@@ -189,7 +189,7 @@ class Wrong(Perturbation):
     [
         (Perturbation(), "'Perturbation' has no bounds; expected a method bounds"),
         (Wrong({"azimut_deg": 3.0}), "'Wrong' bounds azimut_deg; expected some of azimuth_deg, elevation_deg"),
-        (Wrong({}, rows=2), r"amounts of shape \[2, 9\]; expected finite numbers, 9 in each of 1 or 5 rows"),
+        (Wrong({}, rows=2), r"amounts of shape \[2, 11\]; expected finite numbers, 11 in each of 1 or 5 rows"),
         (Wrong({}, value=math.nan), "expected finite numbers"),
     ],
     ids=["no bounds", "unknown amount", "rows", "not a number"],

@@ -19,9 +19,9 @@ class Drift(Perturbation):
     moves_rig: ClassVar[bool] = True
     allows_per_frame: ClassVar[bool] = False
 
-    # Largest turn to either side, in degrees.
+    # Largest turn to either side, about the vertical, in degrees.
     azimuth_deg: float = between(6.0, 0, 90)
-    # Largest turn up or down, in degrees.
+    # Largest turn up or down, about the horizontal, in degrees.
     elevation_deg: float = between(3.0, 0, 60)
     # Largest shift along each of the camera's axes in metres, where the scale is metric.
     translation_m: float = between(0.02, 0, 10)

@@ -10,13 +10,13 @@ from lerobot_msdyn.core.perturbation import Perturbation, Viewpoint
 @Perturbation.register_subclass("orbit")
 @dataclass
 class Orbit(Perturbation):
-    """Turn the camera about the point it looks at, and shift it."""
+    """Turn the camera about the point it looks at, and shift it; what is upright stays upright."""
 
     moves_rig: ClassVar[bool] = True
 
-    # Largest turn to either side, in degrees.
+    # Largest turn to either side, about the vertical, in degrees.
     azimuth_deg: float = between(10.0, 0, 90)
-    # Largest turn up or down, in degrees.
+    # Largest turn up or down, about the horizontal, in degrees.
     elevation_deg: float = between(5.0, 0, 60)
     # Largest shift along each of the camera's axes in metres, where the scale is metric.
     translation_m: float = between(0.02, 0, 10)
