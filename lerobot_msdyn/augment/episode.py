@@ -13,13 +13,15 @@ from torch import Tensor
 
 from lerobot_msdyn.augment.backgrounds import Backgrounds
 from lerobot_msdyn.core.config import Recipe
-from lerobot_msdyn.core.errors import ConfigError
+from lerobot_msdyn.core.errors import ConfigError, EpisodeError
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.dataset.calibration import read_calibration
 from lerobot_msdyn.dataset.provenance import SOURCE_VARIANT, Provenance, camera_pose
-from lerobot_msdyn.dataset.read import depth_key_of, read_episode
+from lerobot_msdyn.dataset.read import depth_key_of, read_colour, read_episode
+from lerobot_msdyn.dataset.rows import read_rows
 from lerobot_msdyn.dataset.staging import SCENE
 from lerobot_msdyn.dataset.write import NewEpisode, OutputDataset
+from lerobot_msdyn.priors.camera.path import displacement_px
 from lerobot_msdyn.reconstruction.reconstruct import reconstruct
 from lerobot_msdyn.reconstruction.result import Reconstruction
 from lerobot_msdyn.render.devices import chosen_device
@@ -53,7 +55,7 @@ def augment_episode(
     """
     episode = read_episode(source, index, cameras, recipe.camera, recorded_depth=recipe.priors.reads_recorded_depth)
     kept = output.episode(index)
-    scenes = {}
+    scenes, displaced = {}, {}
     for key, view in episode.views.items():
         progress(f"episode {index}: fitting {key}", 0.0)
         make_scene = functools.partial(
@@ -67,6 +69,7 @@ def augment_episode(
             key=key,
         )
         scenes[key] = kept.keep(f"{SCENE}_{key}", make_scene)
+        displaced[key] = _displaced_px(source, key, view)
     ready = {key: on_device(scene, chosen_device(recipe.device)) for key, scene in scenes.items()}
     priors = {key: scene.provenance for key, scene in scenes.items()}
     other = _other_pose(recipe, index, episode.views[cameras[0]])
@@ -75,7 +78,7 @@ def augment_episode(
         new.append(NewEpisode(index, Provenance(source.repo_id, index, SOURCE_VARIANT, recipe.seed, {}, priors)))
     for variant in range(recipe.variants):
         progress(f"episode {index}: rendering variant {variant}", 0.0)
-        make_episode = functools.partial(_rendered, source, index, variant, recipe, output, ready, other)
+        make_episode = functools.partial(_rendered, source, index, variant, recipe, output, ready, displaced, other)
         new.append(kept.keep(f"variant_{variant:02d}", make_episode))
         progress("", 0.5 / recipe.variants)
     if recipe.save_scenes:
@@ -91,39 +94,57 @@ def _rendered(
     recipe: Recipe,
     output: OutputDataset,
     scenes: Mapping[str, Reconstruction],
+    displaced: Mapping[str, float | None],
     other: Tensor | None,
 ) -> NewEpisode:
     """One new episode, rendered and encoded; nothing is rendered of one that was dropped."""
     start = time.perf_counter()
-    chosen, gate = _accepted(scenes, recipe, index, variant, other)
+    chosen, gate, dropped = _accepted(scenes, recipe, index, variant, other)
+    for key, view in gate["views"].items():
+        view["camera"] = scenes[key].stands.entry() | {"displaced_px": displaced[key]}
     seconds = {"judging": round(time.perf_counter() - start, 1)}
     seconds |= {f"fitting {key}": round(scene.seconds["fit"], 1) for key, scene in scenes.items()}
-    dropped = gate["rejected"][-1] if len(gate["rejected"]) > recipe.gate.redraws else ""
     new = _staged(source, index, variant, recipe, output, scenes, chosen, gate, dropped=dropped)
     return replace(new, seconds=seconds)
 
 
 def _accepted(
     scenes: Mapping[str, Reconstruction], recipe: Recipe, index: int, variant: int, other: Tensor | None
-) -> tuple[NewCameras, dict[str, Any]]:
-    """The cameras of one new episode, sampled again where they are rejected, and the gate's record."""
+) -> tuple[NewCameras, dict[str, Any], str]:
+    """The cameras of one new episode, sampled again where they are rejected, the gate's record, and why it is dropped.
+
+    Where a recorded camera moves, no other sample is better.
+    """
     rejected: list[str] = []
-    for attempt in range(recipe.gate.redraws + 1):
+    moving = [f"{key}: {scene.stands.reason()}" for key, scene in scenes.items() if scene.stands.moves]
+    if not recipe.gate.enabled or recipe.allow_moving:
+        moving = []
+    for attempt in range(1 if moving else recipe.gate.redraws + 1):
         chosen = new_cameras(scenes, recipe, index, variant, attempt, other)
         views: dict[str, dict[str, Any]] = {
             key: {"distance_m": scene.distance, "what_moves": scene.account.entry()} for key, scene in scenes.items()
         }
-        why = [chosen.rejected] if chosen.rejected else []
+        why = moving + ([chosen.rejected] if chosen.rejected else [])
         for key, scene in scenes.items():
             if recipe.gate.enabled:
                 scores = judge(scene.windows, chosen.cameras[key])
                 views[key]["scores"] = record(scores)
                 why += [f"{key}: {reason}" for reason in reasons(scores, recipe.gate)]
         if not why:
-            break
+            return chosen, {"views": views, "rejected": rejected}, ""
         rejected.append("; ".join(why))
         logger.warning("episode %d variant %d, sample %d: rejected: %s", index, variant, attempt, rejected[-1])
-    return chosen, {"views": views, "rejected": rejected}
+    return chosen, {"views": views, "rejected": rejected}, rejected[-1]
+
+
+def _displaced_px(source: LeRobotDatasetMetadata, key: str, view: View) -> float | None:
+    """By how much a camera's first frame is displaced against that of the dataset (px of 320); None: unknown."""
+    try:
+        first = read_colour(source, 0, key, read_rows(source, 0).slice(0, 1))[0]
+    except EpisodeError:
+        return None
+    found = displacement_px(first, view.rgb[0])
+    return None if found is None else round(found, 1)
 
 
 def _staged(

@@ -8,6 +8,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.priors.camera.stands import Stands
 from lerobot_msdyn.reconstruction.account import Account, pooled
 from lerobot_msdyn.reconstruction.evidence import Evidence
 from lerobot_msdyn.reconstruction.self_check import SelfCheck
@@ -37,6 +38,7 @@ class Reconstruction:
     provenance: dict[str, dict[str, str]]  # prior -> provider, why, model and licence, of all windows
     camera: CameraTrack  # at the size of the recorded video
     distance: float  # m, to the look-at point
+    stands: Stands  # where the camera stood
 
     @property
     def seconds(self) -> dict[str, float]:
