@@ -16,9 +16,9 @@ from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.core.sampling import REFERENCE_WIDTH, evenly, scaled_px, scaled_window
 from lerobot_msdyn.core.serialise import from_named_tensors, named_tensors
-from lerobot_msdyn.priors.depth.flying_pixels import clean_recorded_depth
 from lerobot_msdyn.priors.camera.path import displacement_px
 from lerobot_msdyn.priors.camera.stands import DRIFT_PX, LEAST_PX
+from lerobot_msdyn.priors.depth.flying_pixels import clean_recorded_depth
 from lerobot_msdyn.priors.masks.moving import temporal_median
 from lerobot_msdyn.reconstruction.background import MARGIN_PX, SAMPLES, EmptyScene, empty_scene
 from lerobot_msdyn.scene.gaussians import Gaussians, rgb_to_sh

@@ -197,8 +197,8 @@ def reconstruct(
     """Priors, initial scene and fit of one camera's video; the first of the shared backgrounds that fits is used.
 
     Videos are cut where the camera was moved, and long ones into windows, each with priors and a scene of its own, so
-    that memory beyond the video itself is that of one window. Windows share a background as episodes do. The fit runs on the recipe's device; the result
-    is on the host.
+    that memory beyond the video itself is that of one window. Windows share a background as episodes do. The fit runs
+    on the recipe's device; the result is on the host.
 
     Args:
         view: the video, at its own size.

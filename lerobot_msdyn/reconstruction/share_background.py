@@ -59,9 +59,7 @@ def _kept(views: list[View], numbers: list[int], moving: MovingIn, recipe: Recip
     return from_arrays(cache.get("background", "shared", settings, compute), camera, frames)
 
 
-def moving_in_few(
-    whole: Window, recipe: Recipe, elsewhere: Tensor, episode: int | None, key: str | None
-) -> Tensor:
+def moving_in_few(whole: Window, recipe: Recipe, elsewhere: Tensor, episode: int | None, key: str | None) -> Tensor:
     """What moves in the frames that `few_frames` takes; the masks of all of them, which their fit finds cached."""
     masks = [
         estimate_masks(

@@ -1,9 +1,10 @@
 """Frames of a camera that drifts, as one that stands in its usual place would have recorded them."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import torch
-from dataclasses import replace
 from jaxtyping import Float64, Shaped
 from numpy import ndarray
 
@@ -38,9 +39,7 @@ def steadied(view: View, path: CameraPath) -> View:
     usual = masked_median(rgb[some][:, beyond], seen[some][:, beyond, None]).round().astype(np.uint8)
     for frame in np.flatnonzero(away):
         rgb[frame][beyond] = np.where(seen[frame][beyond, None], rgb[frame][beyond], usual)
-    return replace(
-        view, rgb=torch.from_numpy(rgb), depth=None if depth is None else torch.from_numpy(depth)
-    )
+    return replace(view, rgb=torch.from_numpy(rgb), depth=None if depth is None else torch.from_numpy(depth))
 
 
 def _laid_over(

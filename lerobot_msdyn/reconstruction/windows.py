@@ -55,9 +55,7 @@ def whole_stands(view: View, stands: Stands) -> list[Window]:
     """One window for each place in which the camera stood; where it moves, one as it was recorded."""
     if stands.moves:
         return [Window(0, view)]
-    return [
-        Window(stand.start, view.select(slice(stand.start, stand.end)), stand.path) for stand in stands.stands
-    ]
+    return [Window(stand.start, view.select(slice(stand.start, stand.end)), stand.path) for stand in stands.stands]
 
 
 def windows(whole: Window, recipe: Recipe) -> list[Window]:

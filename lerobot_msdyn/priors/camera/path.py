@@ -5,7 +5,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, Int, UInt8
+from jaxtyping import Bool, Float32, Float64, Int, UInt8
 from numpy import ndarray
 from torch import Tensor
 
@@ -116,7 +116,9 @@ def evened(frame: UInt8[ndarray, "h w 3"]) -> UInt8[ndarray, "i j"]:
     grey = cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)
     height, width = grey.shape
     if width > REFERENCE_WIDTH:
-        grey = cv2.resize(grey, (REFERENCE_WIDTH, round(height * REFERENCE_WIDTH / width)), interpolation=cv2.INTER_AREA)
+        grey = cv2.resize(
+            grey, (REFERENCE_WIDTH, round(height * REFERENCE_WIDTH / width)), interpolation=cv2.INTER_AREA
+        )
     bright = grey.astype(np.float32) + _DARK
     around = cv2.GaussianBlur(bright, (0, 0), max(3.0, scaled_px(10, grey.shape[1])))
     return (100 * bright / around).clip(0, 255).round().astype(np.uint8)

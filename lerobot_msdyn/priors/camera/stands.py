@@ -65,7 +65,7 @@ class Stands:
         """Why new views of the clip cannot be relied on; empty if they can."""
         if not self.moves:
             return ""
-        return f"the camera does not stand still: its background moves by {self.farthest_px:.0f} px (of 320)"
+        return f"its background moves by {self.farthest_px:.0f} px (of 320): it does not stand still"
 
     def entry(self) -> dict[str, Any]:
         """For files: the drift, and each frame before which the camera was moved, by how much; px of 320."""
