@@ -24,6 +24,8 @@ _TURNING_CELLS = 8  # that must agree for a motion to turn or scale the picture
 _DARK = 8.0  # grey levels, added to both sides of a ratio
 _FOR_REST = 1.5  # a still background wins against a motion that so many times as many cells show: an arm may be large
 _NEXT, _NEAR, _ANY, _REST = 0.15, 0.2, 0.35, 0.4  # share of the cells for: a next frame, a guess, any motion, rest
+_MORE, _CLEARLY = 1.5, 0.1  # by so much more cells must be better laid over than worse; relative difference that counts
+_CAPPED = 24  # grey levels; larger differences are of other things
 _GRID = 5  # points to a side of the picture, over which its motion is told
 _SMALLEST_PX = 0.75  # of any picture; less cannot be told at small sizes
 
@@ -102,6 +104,29 @@ def distances_px(path: CameraPath) -> Float64[ndarray, " t"]:
     return np.asarray(np.median(np.linalg.norm(places - still, axis=-1), axis=-1))
 
 
+def cells_won(picture: UInt8[ndarray, "h w"], other: UInt8[ndarray, "h w"], affine: Affine) -> tuple[float, float]:
+    """Shares of a picture's cells that are clearly more, and less, like another laid over it than like it as it is."""
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    size = picture.shape[::-1]
+    seen = cells(cv2.warpAffine(np.ones_like(picture), affine, size, flags=flags)) > 0
+    laid, there = (
+        cells(cv2.absdiff(picture, image)).clip(max=_CAPPED)
+        for image in (cv2.warpAffine(other, affine, size, flags=flags), other)
+    )
+    count = seen.sum(1)
+    with_motion, without = ((seen * each).sum(1) for each in (laid, there))
+    better = (count > 0) & (with_motion < (1 - _CLEARLY) * without)
+    worse = (count > 0) & (without < (1 - _CLEARLY) * with_motion)
+    return float(better.mean()), float(worse.mean())
+
+
+def cells(picture: UInt8[ndarray, "h w"]) -> Float64[ndarray, "c p"]:
+    """The pixels of each cell of a picture."""
+    height, width = (size // count for size, count in zip(picture.shape, (_ROWS, _COLUMNS), strict=True))
+    whole = picture[: height * _ROWS, : width * _COLUMNS].reshape(_ROWS, height, _COLUMNS, width)
+    return whole.transpose(0, 2, 1, 3).reshape(_ROWS * _COLUMNS, -1).astype(np.float64)
+
+
 def _still() -> Affine:
     return np.eye(2, 3)
 
@@ -142,13 +167,17 @@ class _Corners:
         motion, for_motion = self._agreed(found, good, self._any(found, good))
         if for_rest >= _NEXT and _FOR_REST * for_rest >= for_motion:
             return rest
-        return motion if for_motion >= _NEXT else None
+        if for_motion < _NEXT:
+            return None
+        better, worse = cells_won(self.picture, other.picture, motion)
+        return motion if 2 * better + worse - 1 > _MORE * worse else rest
 
     def motion_near(self, other: "_Corners", guess: Affine) -> Affine | None:
         """To any frame: near the guess, else at rest, else whatever most of the corners say."""
         found, good = self._followed(other, guess)
         near, for_near = self._agreed(found, good, guess)
-        rested, rest_good = self._followed(other, _still())
+        as_guessed = np.abs(_moved(guess, self.xy) - self.xy).max(initial=0.0) < self.agree_px
+        rested, rest_good = (found, good) if as_guessed else self._followed(other, _still())
         rest, for_rest = self._agreed(rested, rest_good, _still())
         if for_rest >= _REST and for_rest > for_near:
             return rest

@@ -4,14 +4,13 @@ import itertools
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Float64, UInt8
+from jaxtyping import Float64, UInt8
 from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.core.sampling import REFERENCE_WIDTH, evenly
-from lerobot_msdyn.priors.camera.path import CameraPath, camera_path, distances_px, evened
+from lerobot_msdyn.priors.camera.path import CameraPath, camera_path, cells, cells_won, distances_px, evened
 
 DRIFT_PX = 1.5  # of 320: a picture that goes further within a stand is brought back
 STEP_PX = 2.5  # of 320: a sudden move beyond which the camera stands elsewhere
@@ -24,10 +23,7 @@ _QUIET, _QUIET_PX = 0.08, 0.3  # share of a step, and px of 320, that the camera
 _SELDOM = 0.05  # share of the frames that do not tell how far the picture goes
 _FEW = 2  # frames that may be misjudged
 _COMPARED = 12  # frames in which what the path says is held against the pictures
-_BETTER = 0.93  # relative difference of pictures that are laid over each other by the path
-_CAPPED = 24  # grey levels; larger differences are of other things
-_SEEN = 0.2  # share of the picture that two frames must have in common
-_ROWS, _COLUMNS = 6, 8  # cells
+_SEEN, _MORE = 0.2, 1.5  # share of the cells that must be better laid over the first frame; than worse
 _TEXTURE = 3.0  # grey levels (standard deviation) of a cell that can be recognised
 _ALIKE = 0.7  # correlation with the same cell of another frame, from which it shows the same
 _RESTING = 0.5  # share of the cells; where so many show the same, the camera is where it was
@@ -154,38 +150,19 @@ def _borne_out(
     first: UInt8[ndarray, "h w"], others: list[UInt8[ndarray, "h w"]], affines: Float64[ndarray, "s 2 3"]
 ) -> bool:
     """Whether pictures are more like the first where they are laid over it."""
-    size = first.shape[::-1]
-    laid_over, as_they_are = [], []
-    for picture, affine in zip(others, affines, strict=True):
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        seen = cv2.warpAffine(np.ones_like(picture), affine, size, flags=flags) > 0
-        if seen.mean() < _SEEN:
-            continue
-        laid = cv2.warpAffine(picture, affine, size, flags=flags)
-        laid_over.append(_difference(first, laid, seen))
-        as_they_are.append(_difference(first, picture, seen))
-    return sum(laid_over) < _BETTER * sum(as_they_are)
-
-
-def _difference(one: UInt8[ndarray, "h w"], other: UInt8[ndarray, "h w"], where: Bool[ndarray, "h w"]) -> float:
-    return float(cv2.absdiff(one, other)[where].clip(max=_CAPPED).mean())
+    won = [cells_won(first, picture, affine) for picture, affine in zip(others, affines, strict=True)]
+    better, worse = np.mean(won, axis=0)
+    return bool(better > max(_SEEN, _MORE * worse))
 
 
 def _rests(first: UInt8[ndarray, "h w"], others: list[UInt8[ndarray, "h w"]]) -> bool:
     """Whether much of the picture is where it was."""
-    before = _cells(first)
+    before = cells(first)
     known = before.std(1) > _TEXTURE
     if not known.any():
         return True
-    alike = [np.mean(_correlation(before[known], _cells(picture)[known]) > _ALIKE) for picture in others]
+    alike = [np.mean(_correlation(before[known], cells(picture)[known]) > _ALIKE) for picture in others]
     return float(np.median(alike)) >= _RESTING
-
-
-def _cells(picture: UInt8[ndarray, "h w"]) -> Float64[ndarray, "c p"]:
-    """The pixels of each cell of a picture."""
-    height, width = (size // count for size, count in zip(picture.shape, (_ROWS, _COLUMNS), strict=True))
-    whole = picture[: height * _ROWS, : width * _COLUMNS].reshape(_ROWS, height, _COLUMNS, width)
-    return whole.transpose(0, 2, 1, 3).reshape(_ROWS * _COLUMNS, -1).astype(np.float64)
 
 
 def _correlation(one: Float64[ndarray, "c p"], other: Float64[ndarray, "c p"]) -> Float64[ndarray, " c"]:
