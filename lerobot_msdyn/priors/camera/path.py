@@ -20,11 +20,13 @@ _WINDOW, _LEVELS = (15, 15), 4
 _RETURN_PX = 0.5  # difference of a corner to itself, followed there and back
 _AGREE_PX = 1.0  # of 320, at least 0.75 px: distance of a corner from where a motion takes it
 _ROUNDS = 3  # of least squares over the corners that agree
+_FEATURES, _DISTINCT, _MIN_PAIRS, _ROUGH_PX = 600, 0.8, 12, 3.0  # SIFT: at most; ratio to the second best; agreement
 _TURNING_CELLS = 8  # that must agree for a motion to turn or scale the picture
 _DARK = 8.0  # grey levels, added to both sides of a ratio
 _FOR_REST = 1.5  # a still background wins against a motion that so many times as many cells show: an arm may be large
 _NEXT, _NEAR, _ANY, _REST = 0.15, 0.2, 0.35, 0.4  # share of the cells for: a next frame, a guess, any motion, rest
-_MORE, _CLEARLY = 1.5, 0.1  # by so much more cells must be better laid over than worse; relative difference that counts
+_MORE, _MUCH_MORE = 1.5, 3.0  # times as many cells must be better laid over as worse; for features that look alike
+_CLEARLY = 0.1  # relative difference of cells that counts
 _CAPPED = 24  # grey levels; larger differences are of other things
 _GRID = 5  # points to a side of the picture, over which its motion is told
 _SMALLEST_PX = 0.75  # of any picture; less cannot be told at small sizes
@@ -67,10 +69,9 @@ class CameraPath:
 def camera_path(rgb: UInt8[Tensor, "t h w 3"]) -> CameraPath:
     """The path of a camera, from the corners of its background.
 
-    A frame is first laid over the one before, then over the first, near to where the path has led and, where that
-    fails, anywhere. What moves before the camera does not matter while it covers less than about half of the picture.
-    Frames that cannot be laid over others are taken to be where the one before was. Pictures wider than 320 px are
-    looked at in that width.
+    A frame is first laid over the one before, then over the first, near to where the path has led. What moves before
+    the camera does not matter while it covers less than about half of the picture. Frames that cannot be laid over
+    others are taken to be where the one before was. Pictures wider than 320 px are looked at in that width.
     """
     first, *others = (evened(frame) for frame in rgb.numpy())
     height, width = first.shape
@@ -90,7 +91,7 @@ def camera_path(rgb: UInt8[Tensor, "t h w 3"]) -> CameraPath:
 def displacement_px(picture: UInt8[Tensor, "h w 3"], other: UInt8[Tensor, "h w 3"]) -> float | None:
     """By how much the background of one picture is displaced in another (px of 320); None: it cannot be told."""
     first, second = (_Corners(evened(image.numpy())) for image in (picture, other))
-    found = first.motion_near(second, _still())
+    found = first.motion_anywhere(second)
     if found is None:
         return None
     height, width = first.picture.shape
@@ -165,15 +166,16 @@ class _Corners:
         found, good = self._followed(other, _still())
         rest, for_rest = self._agreed(found, good, _still())
         motion, for_motion = self._agreed(found, good, self._any(found, good))
-        if for_rest >= _NEXT and _FOR_REST * for_rest >= for_motion:
-            return rest
-        if for_motion < _NEXT:
-            return None
-        better, worse = cells_won(self.picture, other.picture, motion)
-        return motion if 2 * better + worse - 1 > _MORE * worse else rest
+        if for_motion >= max(_NEXT, _FOR_REST * for_rest) and self._is_like(other, motion, _MORE):
+            return motion
+        if max(for_rest, for_motion) < _REST:
+            motion, for_motion = self._matched(other)
+            if for_motion >= max(_NEXT, _FOR_REST * for_rest) and self._is_like(other, motion, _MUCH_MORE):
+                return motion
+        return rest if for_rest >= _NEXT else None
 
     def motion_near(self, other: "_Corners", guess: Affine) -> Affine | None:
-        """To any frame: near the guess, else at rest, else whatever most of the corners say."""
+        """To any frame: near the guess, or at rest."""
         found, good = self._followed(other, guess)
         near, for_near = self._agreed(found, good, guess)
         as_guessed = np.abs(_moved(guess, self.xy) - self.xy).max(initial=0.0) < self.agree_px
@@ -181,10 +183,45 @@ class _Corners:
         rest, for_rest = self._agreed(rested, rest_good, _still())
         if for_rest >= _REST and for_rest > for_near:
             return rest
-        if for_near >= _NEAR:
+        return near if for_near >= _NEAR else None
+
+    def motion_anywhere(self, other: "_Corners") -> Affine | None:
+        """To a picture of another time that shows most of the same background, perhaps far from where it was."""
+        near = self.motion_near(other, _still())
+        if near is not None:
             return near
-        anything, for_any = self._agreed(rested, rest_good, self._any(rested, rest_good))
-        return anything if for_any >= _ANY else None
+        found, good = self._followed(other, _still())
+        motion, share = max(
+            self._agreed(found, good, self._any(found, good)), self._matched(other), key=lambda each: each[1]
+        )
+        return motion if share >= _ANY and self._is_like(other, motion, _MORE) else None
+
+    def _is_like(self, other: "_Corners", motion: Affine, more: float) -> bool:
+        """Whether most of the picture is more like another where that is laid over it."""
+        better, worse = cells_won(self.picture, other.picture, motion)
+        return better > more * worse + (1 - better - worse)
+
+    def _matched(self, other: "_Corners") -> tuple[Affine, float]:
+        """A motion near to that of features that look alike (SIFT), and its share of the cells."""
+        sift = cv2.SIFT_create(_FEATURES)
+        (points, looks), (others, other_looks) = (sift.detectAndCompute(each.picture, None) for each in (self, other))
+        if looks is None or other_looks is None or len(others) < 2:
+            return _still(), 0.0
+        pairs = [
+            first
+            for first, second in cv2.BFMatcher().knnMatch(looks, other_looks, k=2)
+            if first.distance < _DISTINCT * second.distance
+        ]
+        if len(pairs) < _MIN_PAIRS:
+            return _still(), 0.0
+        here, there = (
+            np.array([places[i].pt for places, i in chosen], np.float32)
+            for chosen in ([(points, pair.queryIdx) for pair in pairs], [(others, pair.trainIdx) for pair in pairs])
+        )
+        guess, _ = cv2.estimateAffinePartial2D(here, there, method=cv2.RANSAC, ransacReprojThreshold=_ROUGH_PX)
+        if guess is None:
+            return _still(), 0.0
+        return self._agreed(*self._followed(other, guess), guess)
 
     def _followed(self, other: "_Corners", guess: Affine) -> tuple[Float64[ndarray, "n 2"], Bool[ndarray, " n"]]:
         """The corners in another picture, looked for near a guess, and whether they were found."""
