@@ -24,9 +24,9 @@ _FEATURES, _DISTINCT, _MIN_PAIRS, _ROUGH_PX = 600, 0.8, 12, 3.0  # SIFT: at most
 _TURNING_CELLS = 8  # that must agree for a motion to turn or scale the picture
 _DARK = 8.0  # grey levels, added to both sides of a ratio
 _FOR_REST = 1.5  # a still background wins against a motion that so many times as many cells show: an arm may be large
-_NEXT, _NEAR, _ANY, _REST = 0.15, 0.2, 0.35, 0.4  # share of the cells for: a next frame, a guess, any motion, rest
-_MORE, _MUCH_MORE = 1.5, 3.0  # times as many cells must be better laid over as worse; for features that look alike
-_CLEARLY = 0.1  # relative difference of cells that counts
+_NEXT, _NEAR, _REST, _ANY = 0.15, 0.2, 0.3, 0.35  # share of the cells for: a next frame, a guess, rest, any motion
+_MORE = 2.5  # times as many cells must be better laid over by a motion as worse: an arm covers fewer
+_CLEARLY, _SEEN_GREY = 0.1, 1.0  # difference of cells that counts, relative and in grey levels of the evened pictures
 _CAPPED = 24  # grey levels; larger differences are of other things
 _GRID = 5  # points to a side of the picture, over which its motion is told
 _SMALLEST_PX = 0.75  # of any picture; less cannot be told at small sizes
@@ -116,7 +116,7 @@ def cells_won(picture: UInt8[ndarray, "h w"], other: UInt8[ndarray, "h w"], affi
     )
     count = seen.sum(1)
     with_motion, without = ((seen * each).sum(1) for each in (laid, there))
-    better = (count > 0) & (with_motion < (1 - _CLEARLY) * without)
+    better = (count > 0) & (with_motion < (1 - _CLEARLY) * without) & (without - with_motion > _SEEN_GREY * count)
     worse = (count > 0) & (without < (1 - _CLEARLY) * with_motion)
     return float(better.mean()), float(worse.mean())
 
@@ -166,11 +166,11 @@ class _Corners:
         found, good = self._followed(other, _still())
         rest, for_rest = self._agreed(found, good, _still())
         motion, for_motion = self._agreed(found, good, self._any(found, good))
-        if for_motion >= max(_NEXT, _FOR_REST * for_rest) and self._is_like(other, motion, _MORE):
+        if for_motion >= max(_NEXT, _FOR_REST * for_rest) and self._is_like(other, motion):
             return motion
-        if max(for_rest, for_motion) < _REST:
+        if max(for_rest, for_motion) < _ANY:
             motion, for_motion = self._matched(other)
-            if for_motion >= max(_NEXT, _FOR_REST * for_rest) and self._is_like(other, motion, _MUCH_MORE):
+            if for_motion >= max(_NEXT, _FOR_REST * for_rest) and self._is_like(other, motion):
                 return motion
         return rest if for_rest >= _NEXT else None
 
@@ -194,17 +194,21 @@ class _Corners:
         motion, share = max(
             self._agreed(found, good, self._any(found, good)), self._matched(other), key=lambda each: each[1]
         )
-        return motion if share >= _ANY and self._is_like(other, motion, _MORE) else None
+        return motion if share >= _ANY and self._is_like(other, motion) else None
 
-    def _is_like(self, other: "_Corners", motion: Affine, more: float) -> bool:
+    def _is_like(self, other: "_Corners", motion: Affine) -> bool:
         """Whether most of the picture is more like another where that is laid over it."""
         better, worse = cells_won(self.picture, other.picture, motion)
-        return better > more * worse + (1 - better - worse)
+        return better > _MORE * worse + (1 - better - worse)
 
     def _matched(self, other: "_Corners") -> tuple[Affine, float]:
         """A motion near to that of features that look alike (SIFT), and its share of the cells."""
         sift = cv2.SIFT_create(_FEATURES)
-        (points, looks), (others, other_looks) = (sift.detectAndCompute(each.picture, None) for each in (self, other))
+        enlarged = REFERENCE_WIDTH / self.picture.shape[1]
+        (points, looks), (others, other_looks) = (
+            sift.detectAndCompute(cv2.resize(each.picture, None, fx=enlarged, fy=enlarged), None)
+            for each in (self, other)
+        )
         if looks is None or other_looks is None or len(others) < 2:
             return _still(), 0.0
         pairs = [
@@ -214,10 +218,8 @@ class _Corners:
         ]
         if len(pairs) < _MIN_PAIRS:
             return _still(), 0.0
-        here, there = (
-            np.array([places[i].pt for places, i in chosen], np.float32)
-            for chosen in ([(points, pair.queryIdx) for pair in pairs], [(others, pair.trainIdx) for pair in pairs])
-        )
+        here = np.array([points[pair.queryIdx].pt for pair in pairs], np.float32) / enlarged
+        there = np.array([others[pair.trainIdx].pt for pair in pairs], np.float32) / enlarged
         guess, _ = cv2.estimateAffinePartial2D(here, there, method=cv2.RANSAC, ransacReprojThreshold=_ROUGH_PX)
         if guess is None:
             return _still(), 0.0

@@ -24,9 +24,9 @@ _SELDOM = 0.05  # share of the frames that do not tell how far the picture goes
 _FEW = 2  # frames that may be misjudged
 _COMPARED = 12  # frames in which what the path says is held against the pictures
 _SEEN, _MORE = 0.2, 1.5  # share of the cells that must be better laid over the first frame; than worse
-_TEXTURE = 3.0  # grey levels (standard deviation) of a cell that can be recognised
-_ALIKE = 0.7  # correlation with the same cell of another frame, from which it shows the same
-_RESTING = 0.5  # share of the cells; where so many show the same, the camera is where it was
+_ALIKE = 0.7  # correlation of a cell with itself in another frame; so much, and it shows the same
+_EQUAL = 4.0  # grey levels: mean difference; so little, and it does too
+_RESTING = 0.3  # share of the cells; where so many are the same, the camera is where it was
 
 
 @dataclass(frozen=True)
@@ -86,13 +86,12 @@ def stands_along(path: CameraPath, rgb: UInt8[Tensor, "t h w 3"]) -> Stands:
     """
     limit_px = max(DRIFT_PX, LEAST_PX * REFERENCE_WIDTH / path.width)
     away = np.flatnonzero(distances_px(path) > limit_px)
-    far = _extent_px(path) > MOVES_PX
     if len(away) <= _FEW:
         return _one(path, limit_px)
     some = away[evenly(len(away), _COMPARED).numpy()]
     first, *others = (evened(rgb[frame].numpy()) for frame in (0, *some.tolist()))
     if not _borne_out(first, others, path.affines[some]):
-        moves = far and not _rests(first, others)
+        moves = _extent_px(path) > MOVES_PX and not _rests(path, rgb)
         return Stands((Stand(0, len(path), _extent_px(path)),), moves=True) if moves else _one(path, limit_px)
     cuts = _steps(path, max(STEP_PX, limit_px))
     cuts = cuts if len(cuts) <= MOST_STEPS else []
@@ -126,7 +125,7 @@ def _extent_px(path: CameraPath) -> float:
 def _steps(path: CameraPath, least_px: float) -> list[int]:
     """Frames that are the first after a step."""
     places = path.places()
-    speed = np.append(0.0, np.median(np.linalg.norm(np.diff(places, axis=0), axis=-1), axis=-1))
+    speed = _speed(places)
     reach = _BESIDE + _LEVEL
     found: list[list[int]] = []  # frames about each step
     for cut in range(reach, len(path) - reach + 1):
@@ -155,14 +154,22 @@ def _borne_out(
     return bool(better > max(_SEEN, _MORE * worse))
 
 
-def _rests(first: UInt8[ndarray, "h w"], others: list[UInt8[ndarray, "h w"]]) -> bool:
-    """Whether much of the picture is where it was."""
-    before = cells(first)
-    known = before.std(1) > _TEXTURE
-    if not known.any():
+def _rests(path: CameraPath, rgb: UInt8[Tensor, "t h w 3"]) -> bool:
+    """Whether much of the picture stays as it is where the path says that the camera goes fast."""
+    fast = np.flatnonzero(_speed(path.places()) > STEP_PX)
+    if len(fast) == 0:
         return True
-    alike = [np.mean(_correlation(before[known], cells(picture)[known]) > _ALIKE) for picture in others]
-    return float(np.median(alike)) >= _RESTING
+    shares = []
+    for frame in fast[evenly(len(fast), _COMPARED).numpy()]:
+        before, after = (cells(evened(rgb[i].numpy())) for i in (int(frame) - 1, int(frame)))
+        same = (_correlation(before, after) > _ALIKE) | (np.abs(after - before).mean(1) < _EQUAL)
+        shares.append(same.mean())
+    return float(np.median(shares)) >= _RESTING
+
+
+def _speed(places: Float64[ndarray, "t p 2"]) -> Float64[ndarray, " t"]:
+    """How far the picture goes from the frame before to each; px of 320."""
+    return np.append(0.0, np.median(np.linalg.norm(np.diff(places, axis=0), axis=-1), axis=-1))
 
 
 def _correlation(one: Float64[ndarray, "c p"], other: Float64[ndarray, "c p"]) -> Float64[ndarray, " c"]:
