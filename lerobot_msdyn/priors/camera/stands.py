@@ -22,10 +22,11 @@ _BESIDE, _LEVEL = 2, 3  # frames on either side of a step in which the camera ma
 _QUIET, _QUIET_PX = 0.08, 0.3  # share of a step, and px of 320, that the camera goes per frame before and after it
 _SELDOM = 0.05  # share of the frames that do not tell how far the picture goes
 _FEW = 2  # frames that may be misjudged
+_FASTEST = 5  # frames in which a camera that moves cannot seem to rest
 _COMPARED = 12  # frames in which what the path says is held against the pictures
 _SEEN, _MORE = 0.2, 1.5  # share of the cells that must be better laid over the first frame; than worse
-_ALIKE = 0.7  # correlation of a cell with itself in another frame; so much, and it shows the same
-_EQUAL = 4.0  # grey levels: mean difference; so little, and it does too
+_ALIKE = 0.9  # correlation of a cell with itself in another frame; so much, and it shows the same
+_EQUAL = 3.0  # grey levels: mean difference; so little, and it does too
 _RESTING = 0.3  # share of the cells; where so many are the same, the camera is where it was
 
 
@@ -156,11 +157,9 @@ def _borne_out(
 
 def _rests(path: CameraPath, rgb: UInt8[Tensor, "t h w 3"]) -> bool:
     """Whether much of the picture stays as it is where the path says that the camera goes fast."""
-    fast = np.flatnonzero(_speed(path.places()) > STEP_PX)
-    if len(fast) == 0:
-        return True
+    speed = _speed(path.places())
     shares = []
-    for frame in fast[evenly(len(fast), _COMPARED).numpy()]:
+    for frame in np.argsort(-speed[1:])[:_FASTEST] + 1:
         before, after = (cells(evened(rgb[i].numpy())) for i in (int(frame) - 1, int(frame)))
         same = (_correlation(before, after) > _ALIKE) | (np.abs(after - before).mean(1) < _EQUAL)
         shares.append(same.mean())
