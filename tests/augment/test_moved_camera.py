@@ -60,7 +60,7 @@ def test_every_episode_says_where_its_camera_stood(
     assert camera[0]["drift_px"] < 1
     assert [camera[i]["displaced_px"] for i in range(3)] == pytest.approx([0, 28.3, 0], abs=0.5)
     assert camera[2]["moved"] == [{"frame": 12, "px": pytest.approx(16, abs=0.5)}]
-    assert camera[3]["drift_px"] == pytest.approx(19, abs=2)
+    assert camera[3]["drift_px"] == pytest.approx(17, abs=2)  # the ends do not count
     assert all(camera[i]["stands"] for i in camera)
     page = (out / "report.html").read_text()
     assert f"{FRONT}, episode 1: begins 28" in page
