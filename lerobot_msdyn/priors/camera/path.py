@@ -203,7 +203,7 @@ class _Corners:
 
     def _matched(self, other: "_Corners") -> tuple[Affine, float]:
         """A motion near to that of features that look alike (SIFT), and its share of the cells."""
-        sift = cv2.SIFT_create(_FEATURES)
+        sift = cv2.SIFT.create(_FEATURES)
         enlarged = REFERENCE_WIDTH / self.picture.shape[1]
         (points, looks), (others, other_looks) = (
             sift.detectAndCompute(cv2.resize(each.picture, None, fx=enlarged, fy=enlarged), None)
