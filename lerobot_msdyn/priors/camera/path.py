@@ -23,8 +23,9 @@ _ROUNDS = 3  # of least squares over the corners that agree
 _FEATURES, _DISTINCT, _MIN_PAIRS, _ROUGH_PX = 600, 0.8, 12, 3.0  # SIFT: at most; ratio to the second best; agreement
 _TURNING_CELLS = 8  # that must agree for a motion to turn or scale the picture
 _DARK = 8.0  # grey levels, added to both sides of a ratio
+_FEW = 0.35  # share of the cells; where fewer are for a motion, features are looked for that look alike
 _FOR_REST = 1.5  # a still background wins against a motion that so many times as many cells show: an arm may be large
-_NEXT, _NEAR, _REST, _ANY = 0.15, 0.2, 0.3, 0.35  # share of the cells for: a next frame, a guess, rest, any motion
+_NEXT, _NEAR, _REST = 0.15, 0.2, 0.3  # share of the cells for: a next frame, a guess, rest
 _MORE = 2.5  # times as many cells must be better laid over by a motion as worse: an arm covers fewer
 _CLEARLY, _SEEN_GREY = 0.1, 1.0  # difference of cells that counts, relative and in grey levels of the evened pictures
 _CAPPED = 24  # grey levels; larger differences are of other things
@@ -168,7 +169,7 @@ class _Corners:
         motion, for_motion = self._agreed(found, good, self._any(found, good))
         if for_motion >= max(_NEXT, _FOR_REST * for_rest) and self._is_like(other, motion):
             return motion
-        if max(for_rest, for_motion) < _ANY:
+        if max(for_rest, for_motion) < _FEW:
             motion, for_motion = self._matched(other)
             if for_motion >= max(_NEXT, _FOR_REST * for_rest) and self._is_like(other, motion):
                 return motion
@@ -194,7 +195,8 @@ class _Corners:
         motion, share = max(
             self._agreed(found, good, self._any(found, good)), self._matched(other), key=lambda each: each[1]
         )
-        return motion if share >= _ANY and self._is_like(other, motion) else None
+        better, worse = cells_won(self.picture, other.picture, motion)
+        return motion if share >= _NEAR and better > _MORE * worse else None
 
     def _is_like(self, other: "_Corners", motion: Affine) -> bool:
         """Whether most of the picture is more like another where that is laid over it."""
