@@ -17,8 +17,9 @@ from lerobot_msdyn.augment.recorded import read_recorded
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import EpisodeError, PriorError
 from lerobot_msdyn.core.observations import View
-from lerobot_msdyn.reconstruction.pooled_background import MAX_EPISODES, SharedBackground, few, few_frames
+from lerobot_msdyn.reconstruction.pooled_background import MAX_EPISODES, SharedBackground, few
 from lerobot_msdyn.reconstruction.share_background import moving_in_few, share_backgrounds
+from lerobot_msdyn.reconstruction.windows import stands_of, whole_stands
 from lerobot_msdyn.render.cpu.threads import torch_on_one_thread
 
 logger = logging.getLogger(__name__)
@@ -33,7 +34,8 @@ class MaskTask:
     episode: int
     key: str
     recipe: Recipe
-    frames: UInt8[ndarray, "m h w 3"]  # of all episodes that are looked at
+    stand: int  # number of the stretch in which the camera stood in one place
+    frames: UInt8[ndarray, "m h w 3"]  # of all that are looked at
 
 
 Run = Callable[[Callable[[LeRobotDatasetMetadata, MaskTask], Any], list[MaskTask]], Iterable[Any]]
@@ -50,39 +52,42 @@ def shared_backgrounds(
     episodes = background_episodes(source, recipe)
     if not episodes:
         return {}
-    views: dict[str, dict[int, View]] = {key: {} for key in cameras}  # by episode
+    views: dict[str, dict[tuple[int, int], View]] = {key: {} for key in cameras}  # by episode and stretch
     for index in episodes:
         with contextlib.suppress(EpisodeError):
             episode, _ = read_recorded(source, index, cameras, recipe)
             for key, view in episode.views.items():
-                views[key][index] = few_frames(view).shrunk(recipe.fit.max_width)
+                for stand, window in enumerate(whole_stands(view, stands_of(view, recipe))):
+                    views[key][index, stand] = window.few_frames(recipe.fit.max_width)
     backgrounds: dict[str, list[SharedBackground]] = {}
-    for key, of_episodes in views.items():
-        indices = list(of_episodes)
+    for key, of_stands in views.items():
+        indices = list(of_stands)
 
         def moving(
-            numbers: Sequence[int], frames: Tensor, key: str = key, indices: list[int] = indices
+            numbers: Sequence[int], frames: Tensor, key: str = key, indices: list[tuple[int, int]] = indices
         ) -> Iterable[Tensor]:
-            tasks = [MaskTask(indices[number], key, recipe, frames.numpy()) for number in numbers]
+            stands = [indices[number] for number in numbers]
+            tasks = [MaskTask(episode, key, recipe, stand, frames.numpy()) for episode, stand in stands]
             masks = (
                 (moving_in_episode(source, task) for task in tasks) if run is None else run(moving_in_episode, tasks)
             )
             return map(torch.from_numpy, masks)
 
         with torch_on_one_thread():
-            backgrounds[key] = share_backgrounds(list(of_episodes.values()), moving, recipe)
+            backgrounds[key] = share_backgrounds(list(of_stands.values()), moving, recipe)
     return backgrounds
 
 
 def moving_in_episode(source: LeRobotDatasetMetadata, task: MaskTask) -> UInt8[ndarray, "t h w"]:
-    """What moves in those frames of an episode that `few_frames` takes; everything, where no masks can be had."""
+    """What moves in those frames of a stretch that `few_frames` takes; everything, where no masks can be had."""
     view = read_recorded(source, task.episode, [task.key], task.recipe, recorded_depth=False)[0].views[task.key]
+    whole = whole_stands(view, stands_of(view, task.recipe))[task.stand]
     try:
         with torch_on_one_thread():
-            return moving_in_few(view, task.recipe, torch.from_numpy(task.frames), task.episode, task.key).numpy()
+            return moving_in_few(whole, task.recipe, torch.from_numpy(task.frames), task.episode, task.key).numpy()
     except PriorError as error:  # a file of masks may be there for some episodes alone
         logger.warning("shared background: episode %d is left out: %s", task.episode, error)
-        return np.ones((len(few(len(view.rgb))), *task.frames.shape[1:3]), np.uint8)
+        return np.ones((len(few(len(whole.view))), *task.frames.shape[1:3]), np.uint8)
 
 
 def background_episodes(source: LeRobotDatasetMetadata, recipe: Recipe) -> list[int]:

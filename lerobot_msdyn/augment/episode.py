@@ -5,7 +5,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from lerobot.datasets import LeRobotDatasetMetadata
@@ -14,13 +14,15 @@ from torch import Tensor
 from lerobot_msdyn.augment.backgrounds import Backgrounds
 from lerobot_msdyn.augment.recorded import read_recorded
 from lerobot_msdyn.core.config import Recipe
-from lerobot_msdyn.core.errors import ConfigError
+from lerobot_msdyn.core.errors import ConfigError, EpisodeError
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.dataset.calibration import read_calibration
 from lerobot_msdyn.dataset.provenance import SOURCE_VARIANT, Provenance, camera_pose
-from lerobot_msdyn.dataset.read import depth_key_of
+from lerobot_msdyn.dataset.read import depth_key_of, read_colour
+from lerobot_msdyn.dataset.rows import read_rows
 from lerobot_msdyn.dataset.staging import SCENE
 from lerobot_msdyn.dataset.write import NewEpisode, OutputDataset
+from lerobot_msdyn.priors.camera.path import displacement_px
 from lerobot_msdyn.reconstruction.reconstruct import reconstruct
 from lerobot_msdyn.reconstruction.result import Reconstruction
 from lerobot_msdyn.render.devices import chosen_device
@@ -33,6 +35,13 @@ from lerobot_msdyn.views.pictures import Picture, UnseenMasks, log_uncovered, ne
 logger = logging.getLogger(__name__)
 
 Progress = Callable[[str, float], object]  # (what is being done, share of the episode done since the last call)
+
+
+class Noted(NamedTuple):
+    """What is wrong with one camera's recording of an episode."""
+
+    defects: list[str]  # of its pictures, in words
+    displaced_px: float | None  # of 320: how far it begins from where it did in episode 0; None: unknown
 
 
 def augment_episode(
@@ -53,10 +62,11 @@ def augment_episode(
         PriorError: a prior was demanded and cannot be had.
     """
     episode, defects = read_recorded(source, index, cameras, recipe)
-    noted = {key: found.lines() for key, found in defects.items()}
-    for key, lines in noted.items():
-        if lines:
-            logger.warning("%s episode %d, %s: %s", source.repo_id, index, key, "; ".join(lines))
+    noted = {}
+    for key, found in defects.items():
+        noted[key] = Noted(found.lines(), _displaced_px(source, key, episode.views[key]))
+        if noted[key].defects:
+            logger.warning("%s episode %d, %s: %s", source.repo_id, index, key, "; ".join(noted[key].defects))
     other = _other_pose(recipe, index, episode.views[cameras[0]])
     kept = output.episode(index)
     scenes = {}
@@ -80,7 +90,7 @@ def augment_episode(
         new.append(NewEpisode(index, Provenance(source.repo_id, index, SOURCE_VARIANT, recipe.seed, {}, priors)))
     for variant in range(recipe.variants):
         progress(f"episode {index}: rendering variant {variant}", 0.0)
-        make_episode = functools.partial(_rendered, source, index, variant, recipe, output, ready, other, noted)
+        make_episode = functools.partial(_rendered, source, index, variant, recipe, output, ready, noted, other)
         new.append(kept.keep(f"variant_{variant:02d}", make_episode))
         progress("", 0.5 / recipe.variants)
     if recipe.save_scenes:
@@ -96,42 +106,58 @@ def _rendered(
     recipe: Recipe,
     output: OutputDataset,
     scenes: Mapping[str, Reconstruction],
+    noted: Mapping[str, Noted],
     other: Tensor | None,
-    noted: Mapping[str, list[str]],
 ) -> NewEpisode:
     """One new episode, rendered and encoded; nothing is rendered of one that was dropped."""
     start = time.perf_counter()
-    chosen, gate = _accepted(scenes, recipe, index, variant, other)
-    for key, lines in noted.items():
-        gate["views"][key]["defects"] = lines
+    chosen, gate, dropped = _accepted(scenes, recipe, index, variant, other)
+    for key, view in gate["views"].items():
+        view["camera"] = scenes[key].stands.entry() | {"displaced_px": noted[key].displaced_px}
+        view["defects"] = noted[key].defects
     seconds = {"judging": round(time.perf_counter() - start, 1)}
     seconds |= {f"fitting {key}": round(scene.seconds["fit"], 1) for key, scene in scenes.items()}
-    dropped = gate["rejected"][-1] if len(gate["rejected"]) > recipe.gate.redraws else ""
     new = _staged(source, index, variant, recipe, output, scenes, chosen, gate, dropped=dropped)
     return replace(new, seconds=seconds)
 
 
 def _accepted(
     scenes: Mapping[str, Reconstruction], recipe: Recipe, index: int, variant: int, other: Tensor | None
-) -> tuple[NewCameras, dict[str, Any]]:
-    """The cameras of one new episode, sampled again where they are rejected, and the gate's record."""
+) -> tuple[NewCameras, dict[str, Any], str]:
+    """The cameras of one new episode, sampled again where they are rejected, the gate's record, and why it is dropped.
+
+    Where a recorded camera moves, no other sample is better.
+    """
     rejected: list[str] = []
-    for attempt in range(recipe.gate.redraws + 1):
+    moving = [f"{key}: {scene.stands.reason()}" for key, scene in scenes.items() if scene.stands.moves]
+    if not recipe.gate.enabled or recipe.allow_moving:
+        moving = []
+    for attempt in range(1 if moving else recipe.gate.redraws + 1):
         chosen = new_cameras(scenes, recipe, index, variant, attempt, other)
         views: dict[str, dict[str, Any]] = {
             key: {"distance_m": scene.distance, "what_moves": scene.account.entry()} for key, scene in scenes.items()
         }
-        why = [chosen.rejected] if chosen.rejected else []
+        why = moving + ([chosen.rejected] if chosen.rejected else [])
         for key, scene in scenes.items():
             if recipe.gate.enabled:
                 scores = judge(scene.windows, chosen.cameras[key])
                 views[key]["scores"] = record(scores)
                 why += [f"{key}: {reason}" for reason in reasons(scores, recipe.gate)]
         if not why:
-            break
+            return chosen, {"views": views, "rejected": rejected}, ""
         rejected.append("; ".join(why))
         logger.warning("episode %d variant %d, sample %d: rejected: %s", index, variant, attempt, rejected[-1])
-    return chosen, {"views": views, "rejected": rejected}
+    return chosen, {"views": views, "rejected": rejected}, rejected[-1]
+
+
+def _displaced_px(source: LeRobotDatasetMetadata, key: str, view: View) -> float | None:
+    """By how much a camera's first frame is displaced against that of the dataset (px of 320); None: unknown."""
+    try:
+        first = read_colour(source, 0, key, read_rows(source, 0).slice(0, 1))[0]
+    except EpisodeError:
+        return None
+    found = displacement_px(first, view.rgb[0])
+    return None if found is None else round(found, 1)
 
 
 def _staged(

@@ -1,4 +1,4 @@
-"""Cameras that move with the robot, whose pictures are tied to its state, are told from the others by their motion."""
+"""Cameras that do not stand still, on the robot or in a hand, are told from the others by their pictures."""
 
 import itertools
 import logging
@@ -16,6 +16,7 @@ from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import DatasetError, EpisodeError
 from lerobot_msdyn.core.sampling import evenly, scaled_px
 from lerobot_msdyn.dataset.read import Episode
+from lerobot_msdyn.priors.camera.stands import camera_stands
 from lerobot_msdyn.priors.camera.steadiness import SWAY_PX, camera_motion_px
 
 logger = logging.getLogger(__name__)
@@ -29,7 +30,7 @@ SMALL_PX = 160  # width at which pictures are compared
 def still_cameras(
     source: LeRobotDatasetMetadata, episodes: Sequence[int], cameras: list[str], recipe: Recipe
 ) -> list[str]:
-    """Those of the cameras that do not move with the robot, judged by the first episode that can be read.
+    """Those of the cameras that stand still, judged by the first episode that can be read.
 
     The others are left out, with the reason.
 
@@ -64,12 +65,15 @@ def _first_readable(
 
 
 def why_moving(episode: Episode, key: str) -> str:
-    """Why a camera is taken to move with the robot; empty if it is not.
+    """Why a camera is not taken to stand still; empty if it is.
 
-    The background must move by more than a camera on a stand sways, and the whole picture when the robot does; a
-    camera that moves without the robot's doing (held in a hand) is not tied to the state.
+    Its background goes far from where it was in the first frame, whatever the robot does; or it moves by more than a
+    camera on a stand sways, and the whole picture when the robot does.
     """
     rgb = episode.views[key].rgb
+    stands = camera_stands(rgb)
+    if stands.moves:
+        return stands.reason()
     motion = camera_motion_px(rgb) / scaled_px(1, rgb.shape[2])
     if motion <= SWAY_PX:
         return ""

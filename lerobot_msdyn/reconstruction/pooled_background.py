@@ -14,8 +14,10 @@ from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.observations import View
-from lerobot_msdyn.core.sampling import evenly, scaled_px, scaled_window
+from lerobot_msdyn.core.sampling import REFERENCE_WIDTH, evenly, scaled_px, scaled_window
 from lerobot_msdyn.core.serialise import from_named_tensors, named_tensors
+from lerobot_msdyn.priors.camera.path import displacement_px
+from lerobot_msdyn.priors.camera.stands import DRIFT_PX, LEAST_PX
 from lerobot_msdyn.priors.depth.flying_pixels import clean_recorded_depth
 from lerobot_msdyn.priors.masks.moving import temporal_median
 from lerobot_msdyn.reconstruction.background import MARGIN_PX, SAMPLES, EmptyScene, empty_scene
@@ -54,7 +56,7 @@ class SharedBackground:
             camera.world_from_camera[0], self.camera.world_from_camera[0]
         )
         picture = temporal_median(view.rgb[few(len(view.rgb))])[0]
-        return same and shift_px(picture.numpy(), self.empty.rgb.numpy()) < scaled_px(MAX_SHIFT_PX, camera.width)
+        return same and from_one_place(picture, self.empty.rgb)
 
 
 def same_places(views: list[View]) -> list[list[int]]:
@@ -63,14 +65,14 @@ def same_places(views: list[View]) -> list[list[int]]:
     Videos of moving cameras are left out as well.
     """
     groups: list[list[int]] = []
-    pictures: list[UInt8[ndarray, "h w 3"]] = []
+    pictures: list[UInt8[Tensor, "h w 3"]] = []
     for number, view in enumerate(views):
         if not view.camera.is_static:
             continue
-        picture = temporal_median(view.rgb)[0].numpy()
-        shifts = [shift_px(picture, other) for other in pictures]
-        if shifts and min(shifts) < scaled_px(MAX_SHIFT_PX, view.camera.width):
-            groups[int(np.argmin(shifts))].append(number)
+        picture = temporal_median(view.rgb)[0]
+        near = [i for i, other in enumerate(pictures) if from_one_place(picture, other)]
+        if near:
+            groups[min(near, key=lambda i: shift_px(picture.numpy(), pictures[i].numpy()))].append(number)
         else:
             groups.append([number])
             pictures.append(picture)
@@ -89,11 +91,6 @@ def pooled(views: list[View], numbers: list[int], moving: MovingIn) -> SharedBac
         depths.append(unknown if view.depth is None else clean_recorded_depth(view.depth, *view.depth_range))
     instances = torch.cat(list(moving(numbers, frames)))
     return SharedBackground(empty_scene(frames, torch.cat(depths), instances), views[0].camera.select([0]), frames)
-
-
-def few_frames(view: View) -> View:
-    """Some evenly spread frames of a video."""
-    return view.select(torch.tensor(few(len(view))))
 
 
 def completed(own: EmptyScene, shared: EmptyScene, frames: int) -> EmptyScene:
@@ -177,6 +174,17 @@ def colour_match(shared: EmptyScene, own: EmptyScene) -> ColourMatch:
                 break
             line[:] = np.polyfit(x[alike], y[alike], 1)
     return ColourMatch(torch.from_numpy(lines[:, 0].copy()), torch.from_numpy(lines[:, 1].copy()))
+
+
+def from_one_place(picture: UInt8[Tensor, "h w 3"], other: UInt8[Tensor, "i j 3"]) -> bool:
+    """Whether two pictures were taken from the same place: by phase correlation, and by their corners where these tell.
+
+    What is the same in all pictures, such as black bars, can hide a shift from the first.
+    """
+    if shift_px(picture.numpy(), other.numpy()) >= scaled_px(MAX_SHIFT_PX, picture.shape[1]):
+        return False
+    displaced = displacement_px(picture, other)
+    return displaced is None or displaced < max(DRIFT_PX, LEAST_PX * REFERENCE_WIDTH / picture.shape[1])
 
 
 def shift_px(picture: UInt8[ndarray, "h w 3"], other: UInt8[ndarray, "i j 3"]) -> float:

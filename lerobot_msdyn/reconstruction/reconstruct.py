@@ -19,19 +19,21 @@ from lerobot_msdyn.core.observations import Priors, View
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.dataset.provenance import merged
 from lerobot_msdyn.priors import estimate_priors
+from lerobot_msdyn.priors.camera.path import CameraPath
 from lerobot_msdyn.reconstruction.antialias import enlarged
 from lerobot_msdyn.reconstruction.background import NEAR, EmptyScene, empty_scene, look_at_distance
 from lerobot_msdyn.reconstruction.evidence import Evidence, evidence_of
 from lerobot_msdyn.reconstruction.fit import FitResult, fit
 from lerobot_msdyn.reconstruction.initialise import initialise
 from lerobot_msdyn.reconstruction.make_overlay import unexplained
-from lerobot_msdyn.reconstruction.pooled_background import SharedBackground, adapted, completed, few_frames
+from lerobot_msdyn.reconstruction.pooled_background import SharedBackground, adapted, completed
 from lerobot_msdyn.reconstruction.prune import without_contradicted
 from lerobot_msdyn.reconstruction.result import FittedWindow, Reconstruction
 from lerobot_msdyn.reconstruction.self_check import SelfCheck, self_check
 from lerobot_msdyn.reconstruction.share_background import moving_in_few, share_backgrounds
+from lerobot_msdyn.reconstruction.steady import steadied
 from lerobot_msdyn.reconstruction.upright import up_of
-from lerobot_msdyn.reconstruction.windows import windows
+from lerobot_msdyn.reconstruction.windows import Window, stands_of, whole_stands, windows
 from lerobot_msdyn.render.cpu.threads import torch_on_one_thread
 from lerobot_msdyn.render.devices import chosen_device
 from lerobot_msdyn.scene.dynamic import DynamicScene
@@ -54,6 +56,7 @@ class Draft:
     backgrounds: Sequence[SharedBackground]
     progress: Callable[[float], object]
     device: torch.device
+    path: CameraPath | None = None  # from the camera's usual place to where it is at each frame; None: it keeps still
     shared: SharedBackground | None = None  # the one that fits this window
     priors: Priors = field(init=False)
     empty: EmptyScene = field(init=False)
@@ -73,6 +76,12 @@ class Draft:
 
 
 Step = Callable[[Draft], None]
+
+
+def _steady(draft: Draft) -> None:
+    """The video as a camera that keeps still would have recorded it."""
+    if draft.path is not None:
+        draft.view = steadied(draft.view, draft.path)
 
 
 def _priors(draft: Draft) -> None:
@@ -152,6 +161,7 @@ def _antialias(draft: Draft) -> None:
 
 
 STEPS: dict[str, Step] = {
+    "steady": _steady,
     "priors": _priors,
     "background": _background,
     "initial scene": _initial_scene,
@@ -189,9 +199,9 @@ def reconstruct(
 ) -> Reconstruction:
     """Priors, initial scene and fit of one camera's video; the first of the shared backgrounds that fits is used.
 
-    Long videos are cut into windows, each with priors and a scene of its own, so that memory beyond the video itself
-    is that of one window. Windows share a background as episodes do. The fit runs on the recipe's device; the result
-    is on the host.
+    Videos are cut where the camera was moved, and long ones into windows, each with priors and a scene of its own, so
+    that memory beyond the video itself is that of one window. Windows share a background as episodes do. The fit runs
+    on the recipe's device; the result is on the host.
 
     Args:
         view: the video, at its own size.
@@ -208,19 +218,21 @@ def reconstruct(
         EpisodeError: the fit diverges.
         PriorError: a prior was demanded and cannot be had.
     """
-    parts = windows(view, recipe)
+    stands = stands_of(view, recipe)
+    parts = [part for whole in whole_stands(view, stands) for part in windows(whole, recipe)]
     if len(parts) > 1 and not backgrounds and recipe.scene.shared_background:
-        backgrounds = _shared_by_windows([part for _, part in parts], recipe, episode, key)
-    beside = [[window.shrunk(recipe.fit.max_width) for _, window in windows(other, recipe)] for other in others]
+        backgrounds = _shared_by_windows(parts, recipe, episode, key)
+    small_others = [other.shrunk(recipe.fit.max_width) for other in others]
     device = chosen_device(recipe.device)
     fitted: list[FittedWindow] = []
     metric, provenance, distances, ups = [], [], [], []
-    for number, (start, window) in enumerate(parts):
+    for part in parts:
+        frames = slice(part.start, part.start + len(part.view))
         estimate = functools.partial(
             estimate_priors,
             config=recipe.priors,
             camera=recipe.camera,
-            others=[other[number] for other in beside],
+            others=[other.select(frames) for other in small_others],
             episode=episode,
             key=key,
             device=recipe.device,
@@ -229,14 +241,14 @@ def reconstruct(
         def within(share: float) -> object:
             return progress(share / len(parts))
 
-        small = window.shrunk(recipe.fit.max_width)
-        draft = Draft(small, recipe, window.camera.width, estimate, backgrounds, within, device)
+        small = part.view.shrunk(recipe.fit.max_width)
+        draft = Draft(small, recipe, view.camera.width, estimate, backgrounds, within, device, part.path)
         with torch_on_one_thread():
             for name, step in steps.items():
                 begin = time.perf_counter()
                 step(draft)
                 draft.seconds[name] = time.perf_counter() - begin
-        fitted.append(draft.window(start))
+        fitted.append(draft.window(part.start))
         metric.append(draft.priors.metric)
         provenance.append(draft.priors.provenance)
         distances.append(draft.distance)
@@ -249,11 +261,12 @@ def reconstruct(
         camera=camera.resized(view.camera.width, view.camera.height),
         distance=distances[0],
         up=ups[0],
+        stands=stands,
     )
 
 
 def _shared_by_windows(
-    parts: Sequence[View], recipe: Recipe, episode: int | None, key: str | None
+    parts: Sequence[Window], recipe: Recipe, episode: int | None, key: str | None
 ) -> list[SharedBackground]:
     """What the windows of one video show together."""
 
@@ -261,7 +274,7 @@ def _shared_by_windows(
         return [moving_in_few(parts[number], recipe, frames, episode, key) for number in numbers]
 
     with torch_on_one_thread():
-        return share_backgrounds([few_frames(part).shrunk(recipe.fit.max_width) for part in parts], moving, recipe)
+        return share_backgrounds([part.few_frames(recipe.fit.max_width) for part in parts], moving, recipe)
 
 
 def _for_rough_depth(scene: SceneConfig) -> SceneConfig:

@@ -8,6 +8,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.priors.camera.stands import Stands
 from lerobot_msdyn.reconstruction.account import Account, pooled
 from lerobot_msdyn.reconstruction.evidence import Evidence
 from lerobot_msdyn.reconstruction.self_check import SelfCheck
@@ -38,6 +39,7 @@ class Reconstruction:
     camera: CameraTrack  # at the size of the recorded video
     distance: float  # m, to the look-at point
     up: tuple[float, float, float]  # the vertical in the axes of the camera at the first frame
+    stands: Stands  # where the camera stood
 
     @property
     def seconds(self) -> dict[str, float]:

@@ -27,7 +27,7 @@ from lerobot_msdyn.reconstruction.pooled_background import (
     pooled,
     same_places,
 )
-from lerobot_msdyn.reconstruction.windows import windows
+from lerobot_msdyn.reconstruction.windows import Window, windows
 from lerobot_msdyn.render.devices import chosen_device
 
 logger = logging.getLogger(__name__)
@@ -59,11 +59,11 @@ def _kept(views: list[View], numbers: list[int], moving: MovingIn, recipe: Recip
     return from_arrays(cache.get("background", "shared", settings, compute), camera, frames)
 
 
-def moving_in_few(view: View, recipe: Recipe, elsewhere: Tensor, episode: int | None, key: str | None) -> Tensor:
-    """What moves in the frames that `few_frames` takes; the masks of the whole video, which its fit finds cached."""
+def moving_in_few(whole: Window, recipe: Recipe, elsewhere: Tensor, episode: int | None, key: str | None) -> Tensor:
+    """What moves in the frames that `few_frames` takes; the masks of all of them, which their fit finds cached."""
     masks = [
         estimate_masks(
-            window.shrunk(recipe.fit.max_width),
+            part.steady(recipe.fit.max_width),
             recipe.priors,
             recipe.camera,
             elsewhere=elsewhere,
@@ -71,9 +71,9 @@ def moving_in_few(view: View, recipe: Recipe, elsewhere: Tensor, episode: int | 
             key=key,
             device=recipe.device,
         )
-        for _, window in windows(view, recipe)
+        for part in windows(whole, recipe)
     ]
-    return torch.cat(masks)[few(len(view.rgb))]
+    return torch.cat(masks)[few(len(whole.view))]
 
 
 def _fitted(background: SharedBackground, recipe: Recipe) -> SharedBackground:

@@ -16,7 +16,7 @@ from lerobot_msdyn.augment import __main__ as augment
 from lerobot_msdyn.augment import episode as episodes
 from lerobot_msdyn.augment.report import build
 from lerobot_msdyn.augment.report.drawing import cameras_from_above
-from lerobot_msdyn.augment.report.page import LISTED, Pictures, ViewEntry, page
+from lerobot_msdyn.augment.report.page import LISTED, Pictures, ViewEntry, camera_lines, page
 from lerobot_msdyn.augment.report.pictures import data_url, film, heat_map, spread, strip
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.reconstruction.account import Account, account_sentence
@@ -133,6 +133,31 @@ def test_it_says_what_renders_what_moves() -> None:
     still = page("ds", {}, [entry(0, view=entry().view | {"what_moves": nothing})], [])
     assert "nothing moves in the frames that were checked" in still
     outline(still)
+
+
+def test_it_says_where_cameras_were_moved() -> None:
+    def seen(episode: int, **camera: Any) -> ViewEntry:
+        found = {"drift_px": 0.2, "moved": [], "stands": True, "displaced_px": 0.1} | camera
+        return entry(episode, view=entry().view | {"camera": found})
+
+    assert "They keep still." in page("ds", {}, [seen(0), seen(1), seen(2, displaced_px=None)], [])
+    entries = [
+        seen(0, moved=[{"frame": 12, "px": 13.4}]),
+        seen(1, drift_px=9.5),
+        seen(2, displaced_px=30.0),
+        seen(3, displaced_px=30.1),
+        seen(4, stands=False, drift_px=90.0),
+    ]
+    assert camera_lines([*entries, *entries]) == [
+        f"{FRONT}, episode 0: moved by 13.4 px before frame 12",
+        f"{FRONT}, episode 1: drifts by 9.5 px",
+        f"{FRONT}, episode 2: begins 30.0 px from where episode 0 does",
+        f"{FRONT}, episode 4: it moves, by 90.0 px",
+    ]
+    text = page("ds", {}, entries, [])
+    assert "episode 0: moved by 13.4 px" in text
+    assert "<td>9.5</td>" in text
+    outline(text)
 
 
 def test_the_page_is_bounded() -> None:

@@ -16,7 +16,6 @@ from lerobot_msdyn.reconstruction.pooled_background import (
     as_arrays,
     colour_match,
     completed,
-    few_frames,
     from_arrays,
     pooled,
     same_places,
@@ -152,13 +151,12 @@ def test_pictures_of_different_sizes_are_of_different_cameras() -> None:
     assert shift_px(texture(), texture()[:20]) == float("inf")
 
 
-def test_few_frames_of_a_long_video() -> None:
-    view = episode(4, texture())
-    long = dataclasses.replace(
-        view, rgb=view.rgb[:1].expand(100, -1, -1, -1), depth=None, camera=view.camera.select([0] * 100)
-    )
-    assert len(few_frames(long).rgb) == 20
-    assert len(few_frames(view).rgb) == FRAMES
+def test_black_bars_do_not_hide_that_a_camera_was_moved() -> None:
+    wall = texture()
+    views = [episode(4, wall), episode(20, wall), episode(36, wall, shift=6), episode(4, wall, shift=6)]
+    for view in views:
+        view.rgb[:, :8], view.rgb[:, -8:] = 0, 0
+    assert same_places(views) == [[0, 1], [2, 3]]
 
 
 def test_a_background_comes_back_from_its_arrays() -> None:

@@ -11,7 +11,7 @@ from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import PriorError
 from lerobot_msdyn.dataset.read import open_source, read_episode
 from lerobot_msdyn.reconstruction import share_background as sharing
-from lerobot_msdyn.reconstruction.windows import windows
+from lerobot_msdyn.reconstruction.windows import Window, windows
 
 FRONT = "observation.images.front"
 
@@ -58,8 +58,8 @@ def test_windows_are_of_about_equal_length(desk: Path, tmp_path: Path) -> None:
     settings = recipe(tmp_path)
     settings.fit.window_frames = 5
     view = read_episode(open_source("local/desk", desk), 0, [FRONT], settings.camera).views[FRONT]
-    parts = windows(view, settings)
-    assert [start for start, _ in parts] == [0, 4, 8]
-    assert [len(part.rgb) for _, part in parts] == [4, 4, 4]
+    parts = windows(Window(0, view), settings)
+    assert [part.start for part in parts] == [0, 4, 8]
+    assert [len(part.view) for part in parts] == [4, 4, 4]
     settings.priors.masks = "FILE.npz"  # is for the whole video
-    assert len(windows(view, settings)) == 1
+    assert len(windows(Window(0, view), settings)) == 1

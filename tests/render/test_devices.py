@@ -16,6 +16,7 @@ from lerobot_msdyn.core.perturbation import LEVEL
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.motion.model.bases import level_from_motions
 from lerobot_msdyn.priors import PointTracks, Priors
+from lerobot_msdyn.priors.camera.stands import Stand, Stands
 from lerobot_msdyn.reconstruction.background import EmptyScene, background_gaussians
 from lerobot_msdyn.reconstruction.evidence import evidence_of
 from lerobot_msdyn.reconstruction.fit import FitResult, fit
@@ -105,7 +106,8 @@ def test_what_is_made_of_a_fit(gpu: FakeGpu) -> None:
         result = replace(result, scene=replace(result.scene, overlay=overlay))
         host = to_device((result.scene, seen), "cpu")
         window = FittedWindow(0, *host, check, STEPS, 0.0, {})
-        scene = Reconstruction((window,), True, {}, view.camera, 1.0, LEVEL)
+        stands = Stands((Stand(0, len(view), 0.0),))
+        scene = Reconstruction((window,), True, {}, view.camera, 1.0, LEVEL, stands)
         ready = on_device(scene, GPU)
         gpu.waits.clear()
         gpu.copies.clear()

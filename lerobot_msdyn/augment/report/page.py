@@ -10,6 +10,7 @@ from lerobot_msdyn.reconstruction.account import Account, account_sentence, pool
 
 LISTED = 1000  # rows of the table, at most
 SHOWN_POSES = 8  # of a camera that moves along the episode, about
+TOLD_PX = 1.5  # of 320: a camera that drifts or is displaced by less is not named
 STYLE = """
 :root{--ink:#1c2330;--soft:#5c6675;--line:#dde2e8;--paper:#fff;--back:#f5f6f8;--new:#c2351f;--good:#1d7a46}
 *{box-sizing:border-box}
@@ -85,7 +86,7 @@ class ViewEntry:
     variant: int
     camera: str
     amounts: dict[str, float]  # the change of view
-    view: dict[str, Any]  # camera_from_source, distance_m, what_moves, defects, and scores if it was judged
+    view: dict[str, Any]  # camera_from_source, distance_m, what_moves, defects, camera, and scores if it was judged
     rejected: list[str]  # reasons of the samples before
     dropped: bool
     pictures: Pictures | None = None
@@ -126,7 +127,7 @@ def page(title: str, figures: dict[str, str], entries: Sequence[ViewEntry], skip
         f"<title>{text(title)}</title><style>{STYLE}</style></head><body><main>"
         f'<h1>{text(title)}</h1><p class="soft">Left and above: recorded. Right and below: rendered from the new '
         "camera. Scores are estimates: no true picture of the new views exists.</p>"
-        f'<div class="figures">{top}</div>{left_out}<h2>What moves</h2>{moves}'
+        f'<div class="figures">{top}</div>{left_out}<h2>What moves</h2>{moves}{_cameras(entries)}'
         f"<h2>Views</h2>{''.join(_article(entry) for entry in shown[:LISTED])}"
         f'<h2>All views</h2><div class="scroll">{_table(entries[:LISTED])}</div>{rest}'
         "</main></body></html>\n"
@@ -140,6 +141,33 @@ def accounts_of(entries: Iterable[ViewEntry]) -> dict[str, Account]:
         camera: pooled([account for (name, _), account in accounts.items() if name == camera])
         for camera in dict.fromkeys(camera for camera, _ in accounts)
     }
+
+
+def camera_lines(entries: Iterable[ViewEntry]) -> list[str]:
+    """Where a recorded camera was not where it was before, a line each; px of 320."""
+    cameras = {(entry.camera, entry.episode): entry.view["camera"] for entry in entries if "camera" in entry.view}
+    lines: list[str] = []
+    places: dict[str, float] = {}
+    for (key, episode), camera in cameras.items():
+        where = f"{key}, episode {episode}"
+        if not camera["stands"]:
+            lines.append(f"{where}: it moves, by {camera['drift_px']} px")
+            continue
+        lines += [f"{where}: moved by {step['px']} px before frame {step['frame']}" for step in camera["moved"]]
+        if camera["drift_px"] > TOLD_PX:
+            lines.append(f"{where}: drifts by {camera['drift_px']} px")
+        displaced = camera["displaced_px"]
+        if displaced is not None and abs(displaced - places.get(key, 0.0)) > TOLD_PX:
+            lines.append(f"{where}: begins {displaced} px from where episode 0 does")
+        places[key] = places.get(key, 0.0) if displaced is None else displaced
+    return lines
+
+
+def _cameras(entries: Sequence[ViewEntry]) -> str:
+    lines = camera_lines(entries)
+    more = [f"{len(lines) - LISTED} more are in meta/msdyn/episodes.parquet"] if len(lines) > LISTED else []
+    what = bullets(lines[:LISTED] + more) if lines else "<p>They keep still.</p>"
+    return f"<h2>Recorded cameras (px of 320)</h2>{what}"
 
 
 def text(value: object) -> str:
@@ -225,7 +253,8 @@ def _frames(frames: Sequence[dict[str, Any]]) -> str:
 
 def _table(entries: Sequence[ViewEntry]) -> str:
     head = (
-        "<tr><th>episode</th><th>variant</th><th>camera</th><th>expected</th><th>uncovered</th><th>by motion</th>"
+        "<tr><th>episode</th><th>variant</th><th>camera</th><th>drift, px of 320</th><th>expected</th>"
+        "<th>uncovered</th><th>by motion</th>"
         "<th>by overlay</th><th>dynamic PSNR</th><th>without overlay</th><th>resampled</th><th>verdict</th></tr>"
     )
     rows = []
@@ -236,7 +265,8 @@ def _table(entries: Sequence[ViewEntry]) -> str:
         resampled = len(entry.rejected) - int(entry.dropped)
         moves = "".join(f"<td>{cell}</td>" for cell in _account_cells(entry.view["what_moves"]))
         rows.append(
-            f"<tr><td>{entry.episode}</td><td>{entry.variant}</td><td>{text(entry.camera)}</td><td>{values[0]}</td>"
+            f"<tr><td>{entry.episode}</td><td>{entry.variant}</td><td>{text(entry.camera)}</td>"
+            f"<td>{entry.view.get('camera', {}).get('drift_px', '')}</td><td>{values[0]}</td>"
             f'<td>{values[1]}</td>{moves}<td>{resampled}</td><td class="text">{text(verdict)}</td></tr>'
         )
     return f"<table>{head}{''.join(rows)}</table>"
