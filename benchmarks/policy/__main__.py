@@ -19,6 +19,7 @@ import importlib.util
 import logging
 import os
 import sys
+import warnings
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -40,13 +41,13 @@ if TYPE_CHECKING:
 class Study:
     """Trains and tests what is asked for."""
 
-    def __init__(self, out: Path, form: Form, policy: str) -> None:
+    def __init__(self, out: Path, form: Form, policy: str, workers: int) -> None:
         """Nothing is made before it is asked for."""
         from .task import Task
 
         self.form, self.policy = form, policy
         self.store = Store(out, asdict(form))
-        self.sets = Sets(self.store, form)
+        self.sets = Sets(self.store, form, workers)
         self.task = Task()
 
     def run(self, rows: Mapping[str, Row]) -> None:
@@ -127,6 +128,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--policy", choices=("small", "act"), default="small")
     parser.add_argument("--rows", type=lambda text: text.split(";"), default=list(ROWS), help="; between them")
     parser.add_argument("--sweep", choices=SWEEPS, help="rows of this sweep beside transforms and oracle")
+    parser.add_argument("--workers", type=int, default=0, help="of augment; 0: one per core")
     parser.add_argument("--report", action="store_true", help="print the table of what is finished, and stop")
     options = parser.parse_args(arguments)
     unknown = sorted(set(options.rows) - set(ROWS))
@@ -146,11 +148,12 @@ def main(arguments: list[str]) -> None:
     os.environ.setdefault("MUJOCO_GL", "egl" if sys.platform == "linux" else "glfw")
     os.environ.setdefault("HF_HUB_OFFLINE", "1")
     os.environ.setdefault("HF_DATASETS_DISABLE_PROGRESS_BARS", "1")
+    warnings.filterwarnings("ignore", "Cannot enable progress bars")  # which LeRobot tries
     logging.disable(logging.WARNING)
     from lerobot_msdyn.dataset.video import quiet_encoders
 
     quiet_encoders()
-    study = Study(options.out, form, options.policy)
+    study = Study(options.out, form, options.policy, options.workers)
     study.run(rows)
     print((options.out / f"{options.policy}.md").read_text())
 

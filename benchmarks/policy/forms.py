@@ -48,9 +48,8 @@ FORMS = {
         samples=0,
         product=("--fit.steps=100",),
         cameras=FEW,
-        seeds=2,
         steps=2000,
-        input_width=96,
+        input_width=64,
         act_steps=2000,
     ),
     "tiny": Form(

@@ -35,9 +35,9 @@ Episode = tuple["Demonstration", Iterable[np.ndarray]]  # and the front pictures
 class Sets:
     """Makes the training sets that are asked for, once."""
 
-    def __init__(self, store: Store, form: Form) -> None:
-        """Nothing is made before it is asked for."""
-        self.store, self.form = store, form
+    def __init__(self, store: Store, form: Form, workers: int) -> None:
+        """Nothing is made before it is asked for; `workers` are those of the product's command."""
+        self.store, self.form, self.workers = store, form, workers
         self._scene: Scene | None = None
 
     @property
@@ -67,7 +67,7 @@ class Sets:
         """The dataset that a row trains on."""
         return self.store.made(f"sets/{row.dataset}", lambda path: row.make(self, path))
 
-    def write(self, root: Path, episodes: Iterable[Episode]) -> None:
+    def write(self, root: Path, episodes: Iterable[Episode], *, wrist: bool = False) -> None:
         """Records episodes through LeRobot's own API."""
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -81,21 +81,18 @@ class Sets:
             "names": ["height", "width", "channels"],
         }
         vector = {"dtype": "float32", "shape": (len(JOINTS),), "names": [f"{name}.pos" for name in JOINTS]}
-        features = {"observation.state": vector, "action": dict(vector), FRONT: picture, WRIST: dict(picture)}
+        features = {"observation.state": vector, "action": dict(vector), FRONT: picture}
+        if wrist:
+            features[WRIST] = dict(picture)
         dataset = LeRobotDataset.create(
             "local/policy", FPS, features, root=root, robot_type="so101_follower", video_backend="pyav"
         )
         for demonstration, pictures in episodes:
             for t, front in enumerate(pictures):
-                dataset.add_frame(
-                    {
-                        "observation.state": demonstration.state[t],
-                        "action": demonstration.action[t],
-                        FRONT: front,
-                        WRIST: self.scene.pictures(demonstration.qpos[t], wrist=True)[0],
-                        "task": TASK,
-                    }
-                )
+                row = {"observation.state": demonstration.state[t], "action": demonstration.action[t], "task": TASK}
+                if wrist:
+                    row[WRIST] = self.scene.pictures(demonstration.qpos[t], wrist=True)[0]
+                dataset.add_frame(row | {FRONT: front})
             with tamed_av1():
                 dataset.save_episode(parallel_encoding=False)
         dataset.finalize()
@@ -112,9 +109,9 @@ class Sets:
 
 
 def recorded(sets: Sets, path: Path) -> None:
-    """The demonstrations as they are recorded."""
+    """The demonstrations as they are recorded; only here, where the product copies it, is the wrist camera."""
     pose = Placement().world_from_camera()
-    sets.write(path, ((one, sets.rendered(one, pose)) for one in sets.demonstrations()))
+    sets.write(path, ((one, sets.rendered(one, pose)) for one in sets.demonstrations()), wrist=True)
 
 
 def oracle(sets: Sets, path: Path) -> None:
@@ -166,8 +163,9 @@ def front_pictures(dataset: "LeRobotDataset", episode: int) -> list[np.ndarray]:
 def product(sets: Sets, path: Path, flags: tuple[str, ...] = ()) -> None:
     """What the package's command makes of the recording, with its defaults but for the given flags."""
     source = sets.folder(ROWS[RECORDED])
-    places = [f"--root={source}", f"--new_root={path}", "--new_repo_id=local/policy_msdyn", "--repo=local/policy"]
-    command = [sys.executable, "-m", "lerobot_msdyn.augment", *places, f"--variants={sets.form.variants}"]
+    given = [f"--root={source}", f"--new_root={path}", "--new_repo_id=local/policy_msdyn", "--repo=local/policy"]
+    given += [f"--variants={sets.form.variants}", f"--workers={sets.workers}"]
+    command = [sys.executable, "-m", "lerobot_msdyn.augment", *given]
     environment = os.environ | {"LEROBOT_MSDYN_CACHE": str(sets.store.root / "priors"), "HF_HUB_OFFLINE": "1"}
     log = sets.store.root / f"{path.name}.log"
     with log.open("a") as file:
