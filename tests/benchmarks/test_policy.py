@@ -221,10 +221,10 @@ def test_the_whole_study_in_tiny_form(tmp_path: Path) -> None:
         pytest.skip("nothing to render with")
     assert done.returncode == 0, done.stderr
     sets, forms = module("sets"), module("forms")
-    text = (tmp_path / "small.md").read_text()
+    text = (tmp_path / "small_3.md").read_text()
     assert all(f"| {row} |" in text for row in sets.ROWS)
-    ElementTree.parse(tmp_path / "small.svg")
-    cells = sorted((tmp_path / "small").rglob("*.json"))
+    ElementTree.parse(tmp_path / "small_3.svg")
+    cells = sorted((tmp_path / "small_3").rglob("*.json"))
     assert len(cells) == len(sets.ROWS) * len(forms.FORMS["tiny"].cameras)
     frames = {path.stem: np.load(path) for path in (tmp_path / "frames").iterdir()}
     assert {name: file["variant"].max() for name, file in frames.items()} == {
