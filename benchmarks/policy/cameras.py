@@ -93,14 +93,16 @@ def table_homography(source: Matrix, new: Matrix, K: Matrix) -> Matrix:
 def product_pose(view: dict, amounts: dict[str, float]) -> Matrix:
     """World from the camera that stands where the product meant to put it: its change, in true metres.
 
-    The product knows no true scale: its shift is taken as a share of its own look-at distance, which follows from the
-    change, and applied at the true one.
+    Where the product knows no true scale, its shift is taken as a share of its own look-at distance, which follows from
+    the change, and applied at the true one.
 
     Args:
         view: of `meta/msdyn`, `camera_from_source`.
-        amounts: of `meta/msdyn`, what was sampled; shifts as shares of the look-at distance.
+        amounts: of `meta/msdyn`, what was sampled; shifts in metres, or as shares of the look-at distance.
     """
     source_from_camera = np.linalg.inv(np.array(view["camera_from_source"], float))
+    if any(name.startswith("shift_") and name.endswith("_m") for name in amounts):
+        return Placement().world_from_camera() @ source_from_camera
     ahead = np.array([0.0, 0.0, 1.0])
     shares = np.array([amounts.get(f"shift_{axis}_rel", 0.0) for axis in "xyz"]) * amounts.get("shrunk_to", 1.0)
     per_distance = ahead - source_from_camera[:3, :3] @ ahead + shares

@@ -167,7 +167,7 @@ def product(sets: Sets, path: Path, flags: tuple[str, ...] = ()) -> None:
     given += [f"--variants={sets.form.variants}", f"--workers={sets.workers}"]
     command = [sys.executable, "-m", "lerobot_msdyn.augment", *given]
     environment = os.environ | {"LEROBOT_MSDYN_CACHE": str(sets.store.root / "priors"), "HF_HUB_OFFLINE": "1"}
-    log = sets.store.root / f"{path.name}.log"
+    log = sets.store.root / "augment.log"
     with log.open("a") as file:
         done = subprocess.run([*command, *sets.form.product, *flags], env=environment, stdout=file, stderr=file)
     if done.returncode not in (0, 1) or not path.exists():  # 1: some views were rejected, which is part of the product
@@ -176,11 +176,11 @@ def product(sets: Sets, path: Path, flags: tuple[str, ...] = ()) -> None:
 
 def oracle_at_poses_of(name: str, sets: Sets, path: Path) -> None:
     """With each episode, exact pictures of it from the poses that a row of the product chose."""
-    import pyarrow.parquet as pq
+    from lerobot_msdyn.dataset.provenance import read_provenance
 
     base = Placement().world_from_camera()
     poses: list[list[np.ndarray]] = [[base] for _ in range(sets.form.episodes)]
-    for episode in pq.read_table(sets.folder(ROWS[name]) / "meta/msdyn/episodes.parquet").to_pylist():
+    for episode in read_provenance(sets.folder(ROWS[name])) or []:
         if episode["variant"] >= 0:
             view, amounts = (json.loads(episode[column])[FRONT] for column in ("views", "perturbation"))
             poses[episode["source_episode"]].append(product_pose(view, amounts))

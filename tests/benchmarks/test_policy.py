@@ -74,6 +74,7 @@ def test_the_products_pose_is_taken_at_the_true_distance(assumed_m: float) -> No
     amounts = {"azimuth_deg": 20.0, "shift_x_rel": 0.04, "shift_y_rel": -0.02, "shift_z_rel": 0.06, "shrunk_to": 0.5}
     view = {"camera_from_source": np.linalg.inv(change).tolist()}
     np.testing.assert_allclose(cameras.product_pose(view, amounts), new, atol=1e-9)
+    np.testing.assert_allclose(cameras.product_pose(view, {"shift_x_m": 0.01}), base @ change, atol=1e-9)
 
 
 def solved(rate: float, seeds: int = 2, cameras: int = 2, tasks: int = 40) -> np.ndarray:
