@@ -153,7 +153,7 @@ def _accepted(
 def _displaced_px(source: LeRobotDatasetMetadata, key: str, view: View) -> float | None:
     """By how much a camera's first frame is displaced against that of the dataset (px of 320); None: unknown."""
     try:
-        first = read_colour(source, 0, key, read_rows(source, 0).slice(0, 1))[0]
+        first = read_colour(source, 0, key, read_rows(source, 0), [0])[0]
     except EpisodeError:
         return None
     found = displacement_px(first, view.rgb[0])
