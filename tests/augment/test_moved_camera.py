@@ -13,6 +13,8 @@ from panned import HEIGHT, WIDTH, along, panned
 
 from lerobot_msdyn.dataset.provenance import TABLE
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 24
 WAYS = {
     "still": np.zeros((FRAMES, 2)),

@@ -17,6 +17,8 @@ from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.motion.model.compose import compose
 from lerobot_msdyn.synthetic import make_scene
 
+pytestmark = pytest.mark.slow
+
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
 

@@ -27,6 +27,8 @@ from lerobot_msdyn.core.perturbation import PERTURBATIONS, Perturbation
 from lerobot_msdyn.training import MixedViews
 from lerobot_msdyn.views.perturbations.orbit import Orbit
 
+pytestmark = pytest.mark.slow
+
 PLUGIN = Path(__file__).parents[2] / "examples" / "03_own_perturbation.py"
 FRONT = "observation.images.front"
 FAST = {
@@ -161,7 +163,6 @@ def test_other_processes_import_the_plugin_first(plugin: list[str]) -> None:
         assert pool.submit(azimuth_of, swing).result() == 7.0
 
 
-@pytest.mark.slow
 def test_from_the_command_line_with_several_workers(desk: Path, tmp_path: Path) -> None:
     flags = {"repo": "local/desk", "root": desk, "new_root": tmp_path / "new", "episodes": "[0,1]", "workers": 2}
     flags |= FAST | {"cameras": "[front]", "variants": 1, "plugins": PLUGIN, "perturbation.type": "swing"}
