@@ -51,6 +51,7 @@ def test_an_episode_that_is_mostly_blank_is_refused(desk: Path, monkeypatch: pyt
 def test_the_picture_before_an_episode_is_the_last_of_the_one_before(tmp_path: Path) -> None:
     (first, _) = record(tmp_path / "bars", [6, 8])
     source = open_source("local/bars", tmp_path / "bars")
-    (last,) = recorded.last_picture(source, 0, FRONT)
-    assert code_of(last) == first[-1]
+    last = recorded.last_picture(source, 0, FRONT)
+    assert last is not None
+    assert code_of(last[0]) == first[-1]
     assert recorded.last_picture(source, -1, FRONT) is None
