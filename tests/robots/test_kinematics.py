@@ -15,7 +15,8 @@ TWO = """<robot name="two">
 <joint name="turn" type="revolute"><parent link="base"/><child link="arm"/><origin xyz="0 0 1"/><axis xyz="0 0 1"/>
 <limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
 <joint name="out" type="prismatic"><parent link="arm"/><child link="slide"/>
-<origin xyz="2 0 0" rpy="0 0 1.5707963267948966"/><axis xyz="1 0 0"/><limit lower="0" upper="1" effort="1" velocity="1"/></joint>
+<origin xyz="2 0 0" rpy="0 0 1.5707963267948966"/><axis xyz="1 0 0"/>
+<limit lower="0" upper="1" effort="1" velocity="1"/></joint>
 <joint name="mirror" type="prismatic"><parent link="arm"/><child link="copy"/><axis xyz="1 0 0"/>
 <limit lower="0" upper="1" effort="1" velocity="1"/><mimic joint="out" multiplier="-2" offset="0.5"/></joint></robot>"""
 
