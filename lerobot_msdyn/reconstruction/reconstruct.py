@@ -100,7 +100,11 @@ def _background(draft: Draft) -> None:
     empty = empty_scene(draft.view.rgb, draft.priors.depth, draft.priors.instances)
     draft.empty = empty if draft.shared is None else completed(empty, draft.shared.empty, len(draft.view))
     draft.distance = look_at_distance(draft.empty.depth)
-    draft.up = up_of(draft.empty.depth, draft.view.camera.intrinsics[0], draft.recipe.camera.tilt_deg)
+    if draft.view.robot is None:
+        draft.up = up_of(draft.empty.depth, draft.view.camera.intrinsics[0], draft.recipe.camera.tilt_deg)
+    else:  # its world's z axis
+        x, y, z = draft.view.camera.camera_from_world[0, :3, 2].tolist()
+        draft.up = x, y, z
 
 
 def _initial_scene(draft: Draft) -> None:

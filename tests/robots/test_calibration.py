@@ -6,17 +6,17 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from filmed_arm import HEIGHT, NAMES, WIDTH, camera
 from made_up_arms import swing, write_arm
 
 from lerobot_msdyn.robots import Robot, load_robot, map_joints
 from lerobot_msdyn.robots.calibration.contours import Posed, jacobian, sampled, signed_distance
 from lerobot_msdyn.robots.calibration.frames import spread_frames, surface
 from lerobot_msdyn.robots.calibration.refine import Problem, Solution, Spread, hits, refined
-from lerobot_msdyn.robots.calibration.search import Pose, angle_between, looking_at
+from lerobot_msdyn.robots.calibration.search import Pose, angle_between
 from lerobot_msdyn.robots.calibration.solve import solve
 
-WIDTH, HEIGHT, FRAMES = 160, 120, 40
-NAMES = ["pan", "lift", "elbow", "wrist", "roll", "gripper"]
+FRAMES = 40
 
 
 @dataclass
@@ -37,12 +37,6 @@ class Filmed:
         apart = float(np.linalg.norm(pose.centre - self.pose.centre)) / self.pose.distance
         turned = np.degrees(angle_between(pose.rotation, self.pose.rotation))
         return float(turned), 100 * apart, 100 * abs(pose.focal / self.pose.focal - 1)
-
-
-def camera(azimuth: float, elevation: float, distance: float, fov: float) -> Pose:
-    rotation = looking_at(np.radians(azimuth), np.radians(elevation))
-    target = np.array([0.05, 0.0, 0.15])
-    return Pose(rotation, np.array([0.0, 0, distance]) - rotation @ target, 0.5 / float(np.tan(np.radians(fov) / 2)))
 
 
 def filmed(robot: Robot, pose: Pose, state: np.ndarray) -> Filmed:

@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 from numpy import ndarray
 
+from lerobot_msdyn.core.images import masked_median
 from lerobot_msdyn.priors.masks.change import Colours, Reference, along_edges, to_lab
 
 _LEAST_EMPTY = 4  # frames in which a pixel is seen without the robot, for its background to be known
@@ -31,10 +32,8 @@ class RobotMasks:
             robot: where it is about, slightly too large.
         """
         frames = self._frames
-        covered = np.where(robot[..., None], np.nan, frames.astype(np.float32))
         known = (~robot).sum(0) >= _LEAST_EMPTY
-        filled = np.where(known[..., None], covered, frames)
-        empty = np.nanmedian(filled, axis=0).astype(np.uint8)
+        empty = masked_median(frames, (~robot | ~known)[..., None]).astype(np.uint8)
         reference = Reference(empty, _noise(frames, empty))
         changes = [reference.change(frame) for frame in frames]
         colours = Colours()
