@@ -60,7 +60,7 @@ class CalibrateConfig:
     # At most so many episodes are read, evenly spread.
     max_episodes: int = between(10, 1, 1000)
     # Frames that are looked at, over all episodes.
-    frames: int = between(56, MIN_FRAMES, 1000)
+    frames: int = between(96, MIN_FRAMES, 1000)
     # The calibration file that is written, for --camera.calibration; pictures are written beside it.
     out: Path = Path("calibration.json")
     robot: RobotConfig = field(default_factory=RobotConfig)
@@ -167,7 +167,7 @@ def _one_camera(
 
     from lerobot_msdyn.dataset.read import read_colour
     from lerobot_msdyn.dataset.rows import read_rows
-    from lerobot_msdyn.priors.masks.robot import RobotMasks, first_masks
+    from lerobot_msdyn.priors.masks.robot import RobotPictures
     from lerobot_msdyn.robots.calibration.solve import solve
 
     pictures, values, rates = [], [], []
@@ -179,10 +179,10 @@ def _one_camera(
         course = mapping.values(states[index])
         values.append(course[frames])
         rates.append(np.gradient(course, 1 / source.fps, axis=0)[frames] if len(course) > 1 else 0 * course[frames])
-    frames = np.stack(pictures)
+    looked_at = np.stack(pictures)
     value, rate = np.concatenate(values), np.concatenate(rates)
-    verdict = solve(robot, value, rate, first_masks(frames), RobotMasks(frames))
-    return verdict, frames, verdict.solution.values(value, rate)
+    verdict = solve(robot, value, rate, RobotPictures(looked_at))
+    return verdict, looked_at, verdict.solution.values(value, rate)
 
 
 def _summary(verdict: "Verdict") -> str:

@@ -1,7 +1,7 @@
 """The robot told from other things that move, once it is roughly known where it is in each frame."""
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32, Int64, UInt8
 from numpy import ndarray
 
 from lerobot_msdyn.core.images import masked_median
@@ -12,41 +12,52 @@ _NOISE_FLOOR = 1.0  # CIE Lab units
 _SURE = 3.0
 
 
-def first_masks(frames: UInt8[ndarray, "t h w 3"]) -> Bool[ndarray, "t h w"]:
-    """What differs from the median of frames in which the robot stands differently."""
-    empty = np.median(frames, axis=0).astype(np.uint8)
-    reference = Reference(empty, _noise(frames, empty))
-    return np.stack([along_edges(reference.change(frame), frame) > 0 for frame in frames])
+class RobotPictures:
+    """What pictures show of a robot that stands differently in each of them."""
 
+    def __init__(self, pictures: UInt8[ndarray, "t h w 3"]) -> None:
+        self._pictures = pictures
 
-class RobotMasks:
-    """Sharpens masks of a robot by the empty scene behind it and by its colours."""
+    def moving(self, frames: Int64[ndarray, " k"]) -> Bool[ndarray, "k h w"]:
+        """What differs from the median."""
+        empty = np.median(self._pictures, axis=0).astype(np.uint8)
+        reference = Reference(empty, _noise(self._pictures[frames], empty))
+        some = self._pictures[frames]
+        return np.stack([along_edges(reference.change(picture), picture) > 0 for picture in some])
 
-    def __init__(self, frames: UInt8[ndarray, "t h w 3"]) -> None:
-        self._frames = frames
-
-    def __call__(self, robot: Bool[ndarray, "t h w"]) -> tuple[Bool[ndarray, "t h w"], Bool[ndarray, "t h w"]]:
-        """What is the robot, and where that can be told.
+    def masks(
+        self, robot: Bool[ndarray, "k h w"], frames: Int64[ndarray, " k"]
+    ) -> tuple[Bool[ndarray, "k h w"], Bool[ndarray, "h w"]]:
+        """What is the robot, by what is behind it and by its colours; and where that can be told.
 
         Args:
-            robot: where it is about, slightly too large.
+            robot: where it is about, slightly too large; beyond it nothing is the robot.
+            frames: the pictures that are looked at.
         """
-        frames = self._frames
-        known = (~robot).sum(0) >= _LEAST_EMPTY
-        empty = masked_median(frames, (~robot | ~known)[..., None]).astype(np.uint8)
-        reference = Reference(empty, _noise(frames, empty))
-        changes = [reference.change(frame) for frame in frames]
+        some = self._pictures[frames]
+        empty, known = _empty(some, robot)
+        reference = Reference(empty, _noise(some, empty))
+        changes = [np.where(known, reference.change(picture), 0).astype(np.float32) for picture in some]
         colours = Colours()
-        for frame, near, change in zip(frames, robot, changes, strict=True):
-            sure = np.where(near, np.where(known, change, 0), -2 * _SURE).astype(np.float32)
-            colours.add(frame, sure, _SURE)
-        masks = np.stack(
-            [
-                along_edges(np.where(known, change, 0).astype(np.float32) + colours.odds(frame), frame) > 0
-                for frame, change in zip(frames, changes, strict=True)
-            ]
-        )
-        return masks, np.broadcast_to(known, masks.shape)
+        for picture, near, change in zip(some, robot, changes, strict=True):
+            colours.add(picture, np.where(near, change, -2 * _SURE).astype(np.float32), _SURE)
+        odds = zip(some, changes, strict=True)
+        masks = np.stack([along_edges(change + colours.odds(picture), picture) > 0 for picture, change in odds])
+        return masks & robot, known
+
+    def difference(self, robot: Bool[ndarray, "t h w"]) -> tuple[Float32[ndarray, "t h w"], Bool[ndarray, "h w"]]:
+        """Distance of colours to those of the scene without the robot (CIE Lab units), and where it is known."""
+        empty, known = _empty(self._pictures, robot)
+        before = to_lab(empty)
+        return np.stack([np.linalg.norm(to_lab(picture) - before, axis=-1) for picture in self._pictures]), known
+
+
+def _empty(
+    pictures: UInt8[ndarray, "t h w 3"], robot: Bool[ndarray, "t h w"]
+) -> tuple[UInt8[ndarray, "h w 3"], Bool[ndarray, "h w"]]:
+    """The scene without the robot, and where it is known."""
+    known = (~robot).sum(0) >= _LEAST_EMPTY
+    return masked_median(pictures, (~robot | ~known)[..., None]).astype(np.uint8), known
 
 
 def _noise(frames: UInt8[ndarray, "t h w 3"], empty: UInt8[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:

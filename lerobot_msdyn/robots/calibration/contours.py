@@ -14,6 +14,10 @@ from lerobot_msdyn.robots.kernels import draw_triangles, place_vertices, trace_e
 from lerobot_msdyn.robots.kinematics import link_poses
 
 FAR = np.float32(1e6)
+NORMAL_PX = 1.5  # over which an outline's direction is smoothed
+REACH_PX, STEP_PX = 4.0, 0.5  # of the profiles across an outline
+INSIDE_PX, OUTSIDE_PX = -1.5, 2.0  # beyond which a profile is taken as of the robot, and of what is behind
+LEAST_CONTRAST = 8.0  # CIE Lab units between the two
 
 
 @dataclass(frozen=True)
@@ -24,9 +28,15 @@ class Outline:
     xy: Float64[ndarray, "n 2"]  # px
     point: Float64[ndarray, "n 3"]  # m, in the robot's frame
     link: Int32[ndarray, " n"]
+    normal: Float64[ndarray, "n 2"]  # unit vectors in the picture, away from the robot
 
     def __len__(self) -> int:
         return len(self.frame)
+
+    def thinned(self, count: int) -> "Outline":
+        """At most so many of the points."""
+        step = -(-len(self) // count) if len(self) else 1
+        return Outline(*(getattr(self, name)[::step] for name in ("frame", "xy", "point", "link", "normal")))
 
 
 class Posed:
@@ -84,16 +94,21 @@ class Posed:
         width, height = size
         out = np.empty((width * height, 4))
         parts: list[tuple[int, ndarray]] = []
+        solid = np.empty((len(self), height, width), np.float32)
         for frame in range(len(self)):
             depth, index = self._buffers(frame, pose, width, height)
             count = trace_edges(index, depth, self.robot.face_link, moving, out)
             parts.append((frame, out[:count].copy()))
+            solid[frame] = cv2.GaussianBlur((index >= 0).astype(np.float32), (0, 0), NORMAL_PX)
         frames = np.concatenate([np.full(len(part), frame) for frame, part in parts])
         x, y, z, link = np.concatenate([part for _, part in parts]).T
         focal = pose.focal * width
         camera = np.stack([(x - width / 2) / focal * z, (y - height / 2) / focal * z, z], axis=1)
         point = (camera - pose.translation) @ pose.rotation
-        return Outline(frames, np.stack([x, y], axis=1), point, link.astype(np.int32))
+        xy = np.stack([x, y], axis=1)
+        _, slope = sampled(solid, frames, xy)
+        normal = -slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-9)
+        return Outline(frames, xy, point, link.astype(np.int32), normal)
 
 
 def jacobian(
@@ -140,3 +155,32 @@ def sampled(
     value = (a * (1 - fx) + b * fx) * (1 - fy) + (c * (1 - fx) + d * fx) * fy
     slope = np.stack([(b - a) * (1 - fy) + (d - c) * fy, (c - a) * (1 - fx) + (d - b) * fx], axis=1)
     return value.astype(np.float64), slope.astype(np.float64)
+
+
+def edges_across(
+    difference: Float32[ndarray, "t h w"], points: Outline, scale: float
+) -> tuple[Float64[ndarray, " n"], Bool[ndarray, " n"]]:
+    """How far an outline lies outside of the edge that is next to it (px), and where there is one.
+
+    The edge is where the difference to the empty scene falls below the mean of its sides: blur does not shift it, and
+    a shadow, which differs less, is not taken for the robot.
+
+    Args:
+        difference: to the empty scene (CIE Lab units).
+        points: the outline, about right.
+        scale: width of the picture in widths of 320 px.
+    """
+    steps = np.arange(-REACH_PX, REACH_PX + STEP_PX / 2, STEP_PX)
+    places = points.xy[:, None] + scale * steps[:, None] * points.normal[:, None]
+    values, _ = sampled(difference, np.repeat(points.frame, len(steps)), places.reshape(-1, 2))
+    profile = values.reshape(len(points), len(steps))
+    inside = np.median(profile[:, steps <= INSIDE_PX], axis=1)
+    outside = np.median(profile[:, steps >= OUTSIDE_PX], axis=1)
+    above = profile > ((inside + outside) / 2)[:, None]
+    last = len(steps) - 1 - above[:, ::-1].argmax(1)  # from outside, the first that is the robot
+    usable = (inside - outside > LEAST_CONTRAST) & (last > 0) & (last < len(steps) - 1)
+    last = last.clip(0, len(steps) - 2)
+    rows = np.arange(len(points))
+    high, low = profile[rows, last], profile[rows, last + 1]
+    share = (high - (inside + outside) / 2) / np.maximum(high - low, 1e-6)
+    return -scale * (steps[last] + STEP_PX * share.clip(0, 1)), usable

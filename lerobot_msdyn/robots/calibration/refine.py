@@ -6,9 +6,13 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 
-from lerobot_msdyn.robots.calibration.contours import Outline, Posed, jacobian, sampled, signed_distance
+from lerobot_msdyn.robots.calibration.contours import Outline, Posed, edges_across, jacobian, sampled, signed_distance
 from lerobot_msdyn.robots.calibration.search import Pose
 from lerobot_msdyn.robots.description import Robot
+
+KNOWN = 0.99
+DIFFERS = 12.0  # CIE Lab units, from the empty scene
+MOST_POINTS = 9000  # of all outlines, in one step
 
 
 @dataclass(frozen=True)
@@ -49,9 +53,11 @@ class Problem:
         distance: Float32[ndarray, "t h w"],
         spread: Spread,
         known: Float32[ndarray, "t h w"] | None = None,
+        difference: Float32[ndarray, "t h w"] | None = None,
     ) -> None:
         self.robot, self.values, self.rate, self.distance, self.spread = robot, values, rate, distance, spread
-        self.known = known  # 1 where the masks can be relied on
+        self.known = known  # 1 where masks and differences can be relied on
+        self.difference = difference  # to the empty scene, CIE Lab units
         self.size = (distance.shape[2], distance.shape[1])
         span = np.ptp(values, axis=0)
         active = span > np.radians(1.5)
@@ -59,10 +65,15 @@ class Problem:
         # What turns everything that moves cannot be told from a turn of the camera.
         self.fixed = robot.moved_by[self.moving].all(0) | ~robot.moved_by[self.moving].any(0)
 
-    def with_masks(self, masks: Bool[ndarray, "t h w"], known: Bool[ndarray, "t h w"]) -> "Problem":
+    def with_masks(self, masks: Bool[ndarray, "t h w"], known: Bool[ndarray, "h w"]) -> "Problem":
         """The same with other masks, which are to be relied on in some pixels alone."""
-        distance, where = signed_distance(masks), known.astype(np.float32)
+        distance, where = signed_distance(masks), np.broadcast_to(known, masks.shape).astype(np.float32)
         return Problem(self.robot, self.values, self.rate, distance, self.spread, where)
+
+    def with_difference(self, difference: Float32[ndarray, "t h w"], known: Bool[ndarray, "h w"]) -> "Problem":
+        """The same with edges of pictures' differences to the empty scene, instead of masks."""
+        where = np.broadcast_to(known, difference.shape).astype(np.float32)
+        return Problem(self.robot, self.values, self.rate, self.distance, self.spread, where, difference)
 
     def observed(
         self, frames: Int64[ndarray, " k"], points: Outline
@@ -72,7 +83,10 @@ class Problem:
         if self.known is None:
             return value, slope, np.ones(len(value), bool)
         known, _ = sampled(self.known[frames], points.frame, points.xy)
-        return value, slope, known > 0.99
+        if self.difference is None:
+            return value, slope, known > KNOWN
+        value, usable = edges_across(self.difference[frames], points, self.size[0] / 320)
+        return value, points.normal, usable & (known > KNOWN)
 
 
 def refined(
@@ -97,7 +111,7 @@ def _step(
 ) -> Solution:
     values = solution.values(problem.values[frames], problem.rate[frames])
     posed = Posed(problem.robot, values)
-    points = posed.outline(solution.pose, problem.size, problem.moving)
+    points = posed.outline(solution.pose, problem.size, problem.moving).thinned(MOST_POINTS)
     if len(points) < 50:
         return solution
     value, slope, known = problem.observed(frames, points)
@@ -109,23 +123,20 @@ def _step(
     weight = known / (1 + (residual / scale_px) ** 2)
     columns = [steep, np.ones((len(points), 1))]
     spread, count = problem.spread, by_joints.shape[2]
-    prior = [np.zeros(6), [1 / spread.log_focal], [1 / spread.grown_px]]
-    at = [np.zeros(6), [np.log(solution.pose.focal / 0.9)], [solution.grown_px]]
+    prior = [0.0] * 6 + [1 / spread.log_focal, 1 / spread.grown_px]
+    at = [0.0] * 6 + [float(np.log(solution.pose.focal / 0.9)), solution.grown_px]
     if joints:
         free = ~problem.fixed
         columns += [turned * free, turned * free * (state - state.mean(0)), (turned * rate).sum(1, keepdims=True)]
-        prior += [
-            np.full(count, 1 / np.radians(spread.offset_deg)),
-            np.full(count, 1 / spread.scale),
-            [1 / spread.lag_s],
-        ]
-        at += [solution.offset + (solution.scale - 1) * problem.values.mean(0), solution.scale - 1, [solution.lag_s]]
-    design, prior, at = np.concatenate(columns, 1), np.concatenate(prior), np.concatenate(at)
+        prior += [1 / np.radians(spread.offset_deg)] * count + [1 / spread.scale] * count + [1 / spread.lag_s]
+        offset = solution.offset + (solution.scale - 1) * problem.values.mean(0)
+        at += [*offset, *(solution.scale - 1), solution.lag_s]
+    design, strength = np.concatenate(columns, 1), np.array(prior)
     # Neighbouring points of an outline are wrong together: about ten of them are one measurement, of half a pixel.
     precision = 1 / (10 * 0.5**2)
     normal = precision * (design * weight[:, None]).T @ design
-    right = -precision * (design * weight[:, None]).T @ residual - prior**2 * at
-    normal += np.diag(prior**2)
+    right = -precision * (design * weight[:, None]).T @ residual - strength**2 * np.array(at)
+    normal += np.diag(strength**2)
     step = np.linalg.solve(normal + np.diag(1e-9 * np.diag(normal) + 1e-12), right)
     covariance = np.linalg.inv(normal + 1e-9 * np.eye(len(normal)) * np.diag(normal).max() * 1e-6)[:7, :7]
     pose, grown = solution.pose.moved(step[:7]), solution.grown_px + step[7]
@@ -154,10 +165,12 @@ def hits(
     seen = robot & problem.moving[link]
     if not len(points):
         return 0.0, 0.0
-    value, _, known = problem.observed(frames, points)
-    if not known.any():
-        return 0.0, 0.0
-    masks = problem.distance[frames] < 0
+    value, _, told = problem.observed(frames, points)
+    known = np.ones(len(points), bool)
+    if problem.known is not None:
+        known = sampled(problem.known[frames], points.frame, points.xy)[0] > KNOWN
+    masks = problem.distance[frames] < 0 if problem.difference is None else problem.difference[frames] > DIFFERS
     overlap = (seen & masks).sum() / max(((seen | masks) & (seen | ~robot)).sum(), 1)
     within = within_px * problem.size[0] / 320
-    return float((np.abs(value + solution.grown_px)[known] < within).mean()), float(overlap)
+    hit = told & (np.abs(value + solution.grown_px) < within)
+    return float(hit.sum() / max(known.sum(), 1)), float(overlap)

@@ -4,6 +4,7 @@ Masks hold more than the robot, and links may rest. So each pixel's course over 
 what does not move with the joints then weighs nothing.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -182,7 +183,7 @@ def improved(fine: Agreement, pose: Pose, steps: int, size: float) -> Candidate:
     return Candidate(pose.moved(best * scale), -value)
 
 
-def _simplex(cost, size: int, steps: int) -> tuple[Float64[ndarray, " n"], float]:
+def _simplex(cost: Callable[[ndarray], float], size: int, steps: int) -> tuple[Float64[ndarray, " n"], float]:
     """Nelder-Mead from the origin with sides of 1."""
     corners = np.concatenate([np.zeros((1, size)), np.eye(size)])
     values = np.array([cost(corner) for corner in corners])
@@ -231,7 +232,7 @@ def _distinct(candidates: list[Candidate], count: int) -> list[Candidate]:
     return kept
 
 
-def shrunk(masks: Bool[ndarray, "t h w"], height: int, width: int) -> Float32[ndarray, "t h w"]:
+def shrunk(masks: Bool[ndarray, "t H W"], height: int, width: int) -> Float32[ndarray, "t h w"]:
     """Share of each cell that is masked."""
     import cv2
 
