@@ -190,7 +190,7 @@ def _summary(verdict: "Verdict") -> str:
     fov = math.degrees(2 * math.atan(0.5 / pose.focal))
     return (
         f"{pose.distance:.3f} m from the robot, field of view {fov:.1f} degrees; {verdict.hits:.0%} of the outlines on "
-        f"edges, overlap {verdict.overlap:.2f}, next best camera {verdict.margin:.0%} behind; {verdict.seconds:.0f} s"
+        f"edges, next best camera {verdict.margin:.0%} behind; {verdict.seconds:.0f} s"
     )
 
 
@@ -207,7 +207,6 @@ def _entry(verdict: "Verdict", feature: dict[str, Any]) -> dict[str, Any]:
         "t": pose.translation.tolist(),
         "covariance": None if covariance is None else covariance.tolist(),
         "hits": verdict.hits,
-        "overlap": verdict.overlap,
         "margin": verdict.margin,
     }
 

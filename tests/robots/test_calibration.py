@@ -95,7 +95,7 @@ def test_outlines_slide_onto_the_masks(front: Filmed) -> None:
     frames = spread_frames(surface(front.robot, front.values), 16)
     solution = refined(problem, start, frames, 20, (4.0, 1.0), joints=False)
     turned, apart, focal = front.off(solution.pose)
-    assert hits(problem, start, frames)[0] < 0.5 < 0.95 < hits(problem, solution, frames)[0]
+    assert hits(problem, start, frames) < 0.5 < 0.95 < hits(problem, solution, frames)
     assert turned < 0.3
     assert apart < 1
     assert focal < 1

@@ -11,7 +11,6 @@ from lerobot_msdyn.robots.calibration.search import Pose
 from lerobot_msdyn.robots.description import Robot
 
 KNOWN = 0.99
-DIFFERS = 12.0  # CIE Lab units, from the empty scene
 MOST_POINTS = 9000  # of all outlines, in one step
 
 
@@ -154,23 +153,15 @@ def _step(
     )
 
 
-def hits(
-    problem: Problem, solution: Solution, frames: Int64[ndarray, " k"], within_px: float = 1.5
-) -> tuple[float, float]:
-    """Share of the outline within some pixels (of a picture 320 wide) of an edge, and IoU of moving links and masks."""
+def hits(problem: Problem, solution: Solution, frames: Int64[ndarray, " k"], within_px: float = 1.5) -> float:
+    """Share of the outline within some pixels (of a picture 320 wide) of an edge."""
     posed = Posed(problem.robot, solution.values(problem.values[frames], problem.rate[frames]))
     points = posed.outline(solution.pose, problem.size, problem.moving)
-    link = np.stack([posed.drawn(frame, solution.pose, *problem.size)[1] for frame in range(len(frames))])
-    robot = link >= 0
-    seen = robot & problem.moving[link]
     if not len(points):
-        return 0.0, 0.0
+        return 0.0
     value, _, told = problem.observed(frames, points)
     known = np.ones(len(points), bool)
     if problem.known is not None:
         known = sampled(problem.known[frames], points.frame, points.xy)[0] > KNOWN
-    masks = problem.distance[frames] < 0 if problem.difference is None else problem.difference[frames] > DIFFERS
-    overlap = (seen & masks).sum() / max(((seen | masks) & (seen | ~robot)).sum(), 1)
-    within = within_px * problem.size[0] / 320
-    hit = told & (np.abs(value + solution.grown_px) < within)
-    return float(hit.sum() / max(known.sum(), 1)), float(overlap)
+    hit = told & (np.abs(value + solution.grown_px) < within_px * problem.size[0] / 320)
+    return float(hit.sum() / max(known.sum(), 1))

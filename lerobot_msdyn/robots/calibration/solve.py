@@ -57,7 +57,6 @@ class Verdict:
 
     solution: Solution
     hits: float  # share of the links' outlines, in frames that were not used, that lie on an edge of what moves
-    overlap: float  # IoU of the moving links with the masks there
     margin: float  # by which the next best camera has fewer hits
     doubt: str  # why it is not to be used; empty if it is
     seconds: float
@@ -92,8 +91,8 @@ def solve(robot: Robot, values: Float64[ndarray, "t j"], rate: Float64[ndarray, 
     if verdict[1] < GOOD_HITS:
         other = _verdict(_slid(coarse, solution, values, rate, pictures, few, used, WIDE, True), held)
         verdict = max(verdict, other, key=lambda each: each[1])
-    solution, share, overlap = verdict
-    return Verdict(solution, share, overlap, margin, _doubt(solution, share, margin), time.perf_counter() - start)
+    solution, share = verdict
+    return Verdict(solution, share, margin, _doubt(solution, share, margin), time.perf_counter() - start)
 
 
 def _chosen(coarse: Problem, found: list[Candidate]) -> tuple[Solution, float]:
@@ -107,7 +106,7 @@ def _chosen(coarse: Problem, found: list[Candidate]) -> tuple[Solution, float]:
     starts = [Solution(each.pose, np.zeros(count), np.ones(count)) for each in kept]
     px = _px(SHORT_PX, coarse)
     tried = [refined(coarse, each, frames, SHORT_ROUNDS, px, joints=False) for each in starts]
-    shares = [hits(coarse, each, frames)[0] for each in tried]
+    shares = [hits(coarse, each, frames) for each in tried]
     best = int(np.argmax(shares))
     others = [share for each, share in zip(tried, shares, strict=True) if _is_other(each.pose, tried[best].pose)]
     text = ", ".join(f"{each.score:.2f} and {share:.2f}" for each, share in zip(kept, shares, strict=True))
@@ -142,12 +141,12 @@ def _slid(
     return problem, solution, corrected
 
 
-def _verdict(slid: tuple[Problem, Solution, Solution], held: Int64[ndarray, " k"]) -> tuple[Solution, float, float]:
-    """The solution to take, the share of its hits, and its overlap."""
+def _verdict(slid: tuple[Problem, Solution, Solution], held: Int64[ndarray, " k"]) -> tuple[Solution, float]:
+    """The solution to take, and the share of its hits."""
     problem, solution, corrected = slid
     plain, better = hits(problem, solution, held), hits(problem, corrected, held)
-    logger.info("hits of held-out frames: %.3f; with corrected joints %.3f", plain[0], better[0])
-    return (corrected, *better) if better[0] > plain[0] + LEAST_GAIN else (solution, *plain)
+    logger.info("hits of held-out frames: %.3f; with corrected joints %.3f", plain, better)
+    return (corrected, better) if better > plain + LEAST_GAIN else (solution, plain)
 
 
 def _about(problem: Problem, solution: Solution) -> Bool[ndarray, "t h w"]:
