@@ -29,6 +29,7 @@ WIDTH = 320  # px, in which videos are looked at
 FRAMES_LOOKED_AT = 3000  # whose states are compared
 MIN_FRAMES = 12
 SHOWN = 6  # frames of the picture
+NORMALISED = 100.5  # largest value of a state that may be in shares of the joints' ranges
 
 
 @dataclass
@@ -85,21 +86,21 @@ def run(arguments: list[str]) -> int:
     wanted = [config.episodes] if isinstance(config.episodes, int) else config.episodes
     states = _states(source, select_episodes(source, wanted), config)
     mapping, chosen = _chosen(robot, source, states, config)
+    pictures = {key: _pictures(source, key, chosen) for key in keys}
+    mapping, verdicts = _best(robot, source, pictures, chosen, _mappings(robot, mapping, states, config), states)
     entries: dict[str, Any] = {}
-    corrections: list[Verdict] = []
-    for key in keys:
-        verdict, frames, values = _one_camera(robot, source, key, chosen, mapping, states)
+    for key, verdict in verdicts.items():
+        values, rates = _values(mapping, states, chosen, source.fps)
         picture = config.out.with_name(f"{config.out.stem}_{key.rsplit('.', 1)[-1]}.png")
-        _show(robot, verdict, frames, values, picture)
+        _show(robot, verdict, pictures[key], verdict.solution.values(values, rates), picture)
         sys.stdout.write(f"{key}  {_summary(verdict)}\n{picture}\n")
         if verdict.doubt:
             logger.error("%s is left out: %s; look at %s", key, verdict.doubt, picture)
         else:
             entries[key] = _entry(verdict, source.features[key])
-            corrections.append(verdict)
     if not entries:
         raise PriorError(f"{config.repo_id}: no camera could be told by {robot.name}'s joints: nothing was written")
-    _write(config.out, {"cameras": entries, "robot": _record(robot, mapping, corrections)})
+    _write(config.out, {"cameras": entries, "robot": _record(robot, mapping, [verdicts[key] for key in entries])})
     sys.stdout.write(f"{config.out}\n")
     return EXIT_OK if len(entries) == len(keys) else EXIT_SOME_EPISODES_FAILED
 
@@ -153,36 +154,74 @@ def _chosen(
     return mapping, {index: sorted(frames) for index, frames in sorted(chosen.items())}
 
 
-def _one_camera(
-    robot: "Robot",
-    source: Any,
-    key: str,
-    chosen: dict[int, list[int]],
-    mapping: "JointMap",
-    states: dict[int, "np.ndarray"],
-) -> tuple["Verdict", "np.ndarray", "np.ndarray"]:
-    """The camera, the frames that were looked at, and the joints in them."""
+def _pictures(source: Any, key: str, chosen: dict[int, list[int]]) -> "np.ndarray":
+    """The chosen frames of a camera, at most `WIDTH` wide."""
     import cv2
     import numpy as np
 
     from lerobot_msdyn.dataset.read import read_colour
     from lerobot_msdyn.dataset.rows import read_rows
-    from lerobot_msdyn.priors.masks.robot import RobotPictures
-    from lerobot_msdyn.robots.calibration.solve import solve
 
-    pictures, values, rates = [], [], []
+    pictures = []
     for index, frames in chosen.items():
         rgb = read_colour(source, index, key, read_rows(source, index))[frames].numpy()
         height, width = rgb.shape[1:3]
         size = (min(width, WIDTH), round(height * min(1.0, WIDTH / width)))
         pictures += [cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in rgb]
+    return np.stack(pictures)
+
+
+def _values(
+    mapping: "JointMap", states: dict[int, "np.ndarray"], chosen: dict[int, list[int]], fps: float
+) -> tuple["np.ndarray", "np.ndarray"]:
+    """Values of the joints in the chosen frames, and their change per second."""
+    import numpy as np
+
+    values, rates = [], []
+    for index, frames in chosen.items():
         course = mapping.values(states[index])
         values.append(course[frames])
-        rates.append(np.gradient(course, 1 / source.fps, axis=0)[frames] if len(course) > 1 else 0 * course[frames])
-    looked_at = np.stack(pictures)
-    value, rate = np.concatenate(values), np.concatenate(rates)
-    verdict = solve(robot, value, rate, RobotPictures(looked_at))
-    return verdict, looked_at, verdict.solution.values(value, rate)
+        rates.append(np.gradient(course, 1 / fps, axis=0)[frames] if len(course) > 1 else 0 * course[frames])
+    return np.concatenate(values), np.concatenate(rates)
+
+
+def _mappings(
+    robot: "Robot", mapping: "JointMap", states: dict[int, "np.ndarray"], config: CalibrateConfig
+) -> list["JointMap"]:
+    """What the joints can be: values within 100 may be degrees, or shares of each joint's range."""
+    import numpy as np
+
+    from lerobot_msdyn.robots.mapping import in_units
+
+    state = np.concatenate(list(states.values()))
+    if config.robot.units != "auto" or mapping.units != "degrees" or float(np.abs(state).max()) > NORMALISED:
+        return [mapping]
+    return [mapping, in_units(robot, mapping, "normalised")]
+
+
+def _best(
+    robot: "Robot",
+    source: Any,
+    pictures: dict[str, "np.ndarray"],
+    chosen: dict[int, list[int]],
+    mappings: list["JointMap"],
+    states: dict[int, "np.ndarray"],
+) -> tuple["JointMap", dict[str, "Verdict"]]:
+    """The cameras, by the first of the mappings that fits well, else by the one that fits best."""
+    from lerobot_msdyn.priors.masks.robot import RobotPictures
+    from lerobot_msdyn.robots.calibration.solve import GOOD_HITS, solve
+
+    tried = []
+    for mapping in mappings:
+        values, rates = _values(mapping, states, chosen, source.fps)
+        verdicts = {key: solve(robot, values, rates, RobotPictures(frames)) for key, frames in pictures.items()}
+        share = max(verdict.hits for verdict in verdicts.values())
+        tried.append((share, mapping, verdicts))
+        if share >= GOOD_HITS:
+            break
+        logger.info("joints in %s: %.0f %% of the outlines lie on edges", mapping.units, 100 * share)
+    _, mapping, verdicts = max(tried, key=lambda item: item[0])
+    return mapping, verdicts
 
 
 def _summary(verdict: "Verdict") -> str:

@@ -4,10 +4,10 @@ import logging
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Bool, Float, Float64, Int64
 from numpy import ndarray
 
 from lerobot_msdyn.core.errors import ConfigError
@@ -32,6 +32,7 @@ class JointMap:
     scale: Float64[ndarray, " j"]  # rad (or m) per unit of the state
     offset: Float64[ndarray, " j"]
     units: str
+    grips: Bool[ndarray, " j"]  # grippers, which are in shares of their range
 
     def values(self, state: Float[ndarray, "t s"]) -> Float64[ndarray, "t j"]:
         """Values of the movable joints: rad, or m."""
@@ -77,9 +78,19 @@ def map_joints(
             offset[index] = min(max(0.0, joint.lower), joint.upper)
             continue
         scale[index], offset[index] = _linear(joint, told, bool(grips[index]), state[:, column])
-    mapped = JointMap(columns, scale, offset, told)
+    mapped = JointMap(columns, scale, offset, told, grips)
     _check_motion(robot, mapped, state)
     return mapped
+
+
+def in_units(robot: Robot, mapping: JointMap, units: str) -> JointMap:
+    """The same with the joints that turn, but the grippers, in degrees or normalised."""
+    scale, offset = mapping.scale.copy(), mapping.offset.copy()
+    for index, name in enumerate(robot.movable):
+        joint = robot.joint(name)
+        if mapping.columns[index] >= 0 and joint.kind != "prismatic" and not mapping.grips[index]:
+            scale[index], offset[index] = _linear(joint, units, False, np.zeros(1))
+    return replace(mapping, scale=scale, offset=offset, units=units)
 
 
 def _columns(robot: Robot, names: Sequence[str] | None, count: int, renamed: Mapping[str, str]) -> Int64[ndarray, " j"]:

@@ -7,6 +7,7 @@ import pytest
 
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.robots import Robot, map_joints
+from lerobot_msdyn.robots.mapping import in_units
 
 NAMES = ["gripper.pos", "pan.pos", "LIFT.pos", "elbow.pos", "wrist.pos", "roll.pos"]
 
@@ -39,6 +40,13 @@ def test_normalised_values_are_those_of_the_range(arm: Robot) -> None:
     assert map_joints(arm, NAMES, moving(-100, 100), "normalised").values(moving(-100, 100))[-1, 0] == pytest.approx(
         1.9
     )
+
+
+def test_the_same_state_in_other_units(arm: Robot) -> None:
+    state = moving(-90, 90)
+    state[:, 0] = 50
+    other = in_units(arm, map_joints(arm, NAMES, state), "normalised")
+    assert other.values(state) == pytest.approx(map_joints(arm, NAMES, state, "normalised").values(state))
 
 
 def test_joints_that_are_not_recorded_rest(arm: Robot) -> None:

@@ -64,6 +64,8 @@ def read_record(entry: Any, where: Path) -> RobotRecord:
         scale = np.array([float(joint["scale"]) for joint in joints.values()])
         offset = np.array([float(joint["offset"]) for joint in joints.values()])
         urdf, licence, lag_s = Path(entry["urdf"]), str(entry.get("licence", "")), float(entry.get("lag_s", 0))
-        return RobotRecord(urdf, licence, JointMap(columns, scale, offset, ""), tuple(joints), lag_s)
+        return RobotRecord(
+            urdf, licence, JointMap(columns, scale, offset, "", np.zeros(len(columns), bool)), tuple(joints), lag_s
+        )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise PriorError(f"{where}: its entry `robot` cannot be used ({error}); calibrate again") from error
