@@ -94,6 +94,7 @@ class RobotSeen:
     depth: Float[Tensor, "t h w"]  # m, z-depth of the robot; 0 = none is there
     moving: Bool[Tensor, "t h w"]  # pixels of links that move during the episode
     ground_m: float  # height of what the robot stands on, in the world
+    model: Model = Model()  # its description
 
     def select(self, frames: slice | Int[Tensor, " s"]) -> "RobotSeen":
         """The same at some of its frames."""

@@ -68,6 +68,8 @@ def estimate_priors(
     if camera.fov_search:
         pinhole, camera_from = with_searched_fov(pinhole, tracks, depth)
     origins = {"camera": camera_from, "masks": masks_from, "depth": depth_from, "tracks": tracks_from}
+    if view.robot is not None:
+        origins["robot"] = Origin("calibration", "its links in masks and depth, by the joints", view.robot.model)
     counts = {"masks": f", {int(instances.max())} instances", "tracks": f", {len(tracks)} tracks"}
     for prior, origin in origins.items():
         logger.info("%s: %s%s", prior, origin.line, counts.get(prior, ""))

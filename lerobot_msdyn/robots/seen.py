@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.core.observations import RobotSeen
+from lerobot_msdyn.core.observations import Model, RobotSeen
 from lerobot_msdyn.robots.calibration.contours import Posed
 from lerobot_msdyn.robots.calibration.record import RobotRecord
 from lerobot_msdyn.robots.calibration.search import Pose
@@ -46,4 +46,5 @@ def robot_seen(
         moving[frame] = (link >= 0) & moves[link]
     root = robot.vertices[np.unique(robot.faces[~robot.moved_by[robot.face_link].any(1)])]
     ground = float(root[:, 2].min()) if len(root) else 0.0
-    return RobotSeen(torch.from_numpy(depth), torch.from_numpy(moving), ground)
+    model = Model(robot.name, licence=robot.licence)
+    return RobotSeen(torch.from_numpy(depth), torch.from_numpy(moving), ground, model)
