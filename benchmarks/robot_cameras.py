@@ -73,11 +73,13 @@ def main() -> None:
             seconds = time.process_time() - start
             text = f"{seed}: {turned:.2f} deg, {apart:.1%}, focal {focal:.1%}; {seconds:.0f} s; {doubt or 'believed'}"
             print(text + (" WRONG" if wrong else ""), flush=True)
-    wrong, believed = (np.array(column) for column in list(zip(*rows, strict=True))[:2])
+    count_wrong = sum(row[0] for row in rows)
+    believed = sum(row[0] and row[1] for row in rows)
+    doubted = sum(not row[0] and not row[1] for row in rows)
     right = np.array([row[2:] for row in rows if not row[0]])
     print(
-        f"{len(rows)} cameras: {1 - wrong.mean():.0%} right, {(wrong & believed).sum()} wrong and believed, "
-        f"{(~wrong & ~believed).sum()} right and doubted"
+        f"{len(rows)} cameras: {1 - count_wrong / len(rows):.0%} right, {believed} wrong and believed, "
+        f"{doubted} right and doubted"
     )
     if len(right):
         turned, apart, focal = np.median(right, axis=0)

@@ -7,7 +7,10 @@ from made_up_arms import write_arm
 
 from lerobot_msdyn.robots import Robot, load_robot
 
-pytest.importorskip("yourdfpy")
+
+@pytest.fixture(autouse=True, scope="session")
+def libraries() -> None:
+    pytest.importorskip("yourdfpy")
 
 
 @pytest.fixture(scope="session")
