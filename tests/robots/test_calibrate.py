@@ -3,7 +3,9 @@
 import json
 from pathlib import Path
 
+import augment_command as augment
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import torch
 from filmed_arm import FRONT, HEIGHT, NAMES, WIDTH, camera, write_filmed
@@ -11,6 +13,7 @@ from filmed_arm import FRONT, HEIGHT, NAMES, WIDTH, camera, write_filmed
 from lerobot_msdyn import calibrate
 from lerobot_msdyn.core.config import CameraConfig, PriorsConfig
 from lerobot_msdyn.core.errors import ConfigError, DatasetError, PriorError
+from lerobot_msdyn.dataset.provenance import TABLE
 from lerobot_msdyn.dataset.read import open_source, read_episode
 from lerobot_msdyn.priors import estimate_priors
 from lerobot_msdyn.robots import Robot
@@ -128,6 +131,17 @@ def test_a_smaller_picture_shows_the_same_arm(recorded: Path, urdf: Path, tmp_pa
     assert small.robot.depth.shape == (len(view), 60, 80)
     share = float((small.robot.depth > 0).float().mean() / (view.robot.depth > 0).float().mean())
     assert share == pytest.approx(1, abs=0.05)
+
+
+@pytest.mark.slow
+def test_new_views_by_the_arm(recorded: Path, urdf: Path, tmp_path: Path) -> None:
+    calibration, out = record(urdf, tmp_path / "c.json"), tmp_path / "new"
+    arguments = ("--repo=local/arm", f"--root={recorded}", f"--new_root={out}", "--episodes=[0]", "--variants=1")
+    more = ("--priors.masks=change", "--priors.depth=plane", "--gate.enabled=false", "--workers=1")
+    assert augment.run(*arguments, *more, f"--camera.calibration={calibration}", *augment.FAST) == 0
+    row = pq.read_table(out / TABLE).to_pylist()[-1]
+    assert "the table that the robot stands on" in row["priors"]
+    assert "as its author gives it" in row["priors"]
 
 
 @pytest.mark.parametrize(

@@ -160,8 +160,8 @@ def hits(problem: Problem, solution: Solution, frames: Int64[ndarray, " k"], wit
     if not len(points):
         return 0.0
     value, _, told = problem.observed(frames, points)
-    known = np.ones(len(points), bool)
-    if problem.known is not None:
-        known = sampled(problem.known[frames], points.frame, points.xy)[0] > KNOWN
     hit = told & (np.abs(value + solution.grown_px) < within_px * problem.size[0] / 320)
-    return float(hit.sum() / max(known.sum(), 1))
+    known = len(points)
+    if problem.known is not None:
+        known = int((sampled(problem.known[frames], points.frame, points.xy)[0] > KNOWN).sum())
+    return float(hit.sum() / max(known, 1))
