@@ -22,10 +22,12 @@ from lerobot.datasets.depth_utils import dequantize_depth
 from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, OBS_STATE
 from torch import Tensor
 
+from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.config import CameraConfig
 from lerobot_msdyn.core.errors import DatasetError, EpisodeError, first_line
-from lerobot_msdyn.core.observations import View
-from lerobot_msdyn.dataset.calibration import make_camera
+from lerobot_msdyn.core.files import cache_folder
+from lerobot_msdyn.core.observations import RobotSeen, View
+from lerobot_msdyn.dataset.calibration import make_camera, read_robot
 from lerobot_msdyn.dataset.checks import IntactEpisodes, check_metadata, picture_size, read_json
 from lerobot_msdyn.dataset.chroma import is_subsampled, restore_chroma
 from lerobot_msdyn.dataset.features import completed
@@ -38,6 +40,8 @@ from lerobot_msdyn.dataset.video_index import (
     frame_numbers,
     index_of,
 )
+from lerobot_msdyn.robots import load_robot
+from lerobot_msdyn.robots.seen import robot_seen
 
 logger = logging.getLogger(__name__)
 
@@ -168,6 +172,7 @@ def read_episode(
     """
     rows = read_rows(meta, index)
     time = torch.from_numpy(on_grid(rows, meta.fps)["timestamp"].to_numpy().astype(np.float32))
+    state = _matrix(rows, OBS_STATE)
     views = {}
     for key in cameras:
         rgb = read_colour(meta, index, key, rows)
@@ -181,16 +186,31 @@ def read_episode(
                     f"its camera {tuple(rgb.shape[1:3])}; "
                     "only depth that is aligned to the colour image can be used (--priors.depth plane goes without)"
                 )
-        views[key] = View(rgb, make_camera(key, index, rgb, config), depth, depth_range)
+        camera = make_camera(key, index, rgb, config)
+        robot = _robot(config, camera, state, meta.fps)
+        views[key] = View(rgb, camera, depth, depth_range, robot)
     return Episode(
         source=EpisodeSource(meta.repo_id, meta.root, index),
         fps=meta.fps,
         time=time - time[0],
         views=views,
-        state=_matrix(rows, OBS_STATE),
+        state=state,
         action=_matrix(rows, ACTION),
         task=task_of(meta, rows),
     )
+
+
+def _robot(
+    config: CameraConfig, camera: CameraTrack, state: Float[Tensor, "t s"] | None, fps: int | float
+) -> RobotSeen | None:
+    """What a calibrated camera sees of the robot, where the calibration names one."""
+    if config.calibration is None or camera.origin != "calibration" or state is None:
+        return None
+    record = read_robot(config.calibration)
+    if record is None:
+        return None
+    robot = load_robot(record.urdf, record.licence, cache_folder("robots"))
+    return robot_seen(robot, record, state, fps, camera, config.calibration)
 
 
 def depth_key_of(meta: LeRobotDatasetMetadata, camera: str) -> str | None:

@@ -24,13 +24,12 @@ import numpy as np
 from jaxtyping import UInt8
 from torch import Tensor
 
-from lerobot_msdyn.core.files import digest_of_file
+from lerobot_msdyn.core.files import CACHE_VARIABLE, cache_folder, digest_of_file
 
 logger = logging.getLogger(__name__)
 
 Arrays = dict[str, np.ndarray]
 
-ENVIRONMENT = "LEROBOT_MSDYN_CACHE"
 _DIGEST = 16  # bytes
 _OFF = ("off", "False")  # YAML reads off as false
 
@@ -70,7 +69,7 @@ class PriorCache:
                 path,
                 error,
                 prior,
-                ENVIRONMENT,
+                CACHE_VARIABLE,
             )
         return arrays
 
@@ -91,10 +90,7 @@ def digest_of(images: UInt8[Tensor, "t h w *c"]) -> str:
 
 def default_folder() -> Path:
     """LEROBOT_MSDYN_CACHE if it is set, else lerobot_msdyn/priors in the user's cache folder."""
-    if os.environ.get(ENVIRONMENT):
-        return Path(os.environ[ENVIRONMENT]).expanduser()
-    home = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(home).expanduser() / "lerobot_msdyn" / "priors"
+    return cache_folder("priors")
 
 
 def _read(path: Path) -> Arrays | None:

@@ -72,7 +72,11 @@ class Draft:
         """Take what stands still as given, and how the camera stands to it."""
         self.empty = empty
         self.distance = look_at_distance(empty.depth)
-        self.up = up_of(empty.depth, self.view.camera.intrinsics[0], self.recipe.camera.tilt_deg)
+        if self.view.robot is None:
+            self.up = up_of(empty.depth, self.view.camera.intrinsics[0], self.recipe.camera.tilt_deg)
+        else:  # its world's z axis
+            x, y, z = self.view.camera.camera_from_world[0, :3, 2].tolist()
+            self.up = x, y, z
 
     def window(self, start: int) -> FittedWindow:
         """What all steps have made, on the host."""
