@@ -34,6 +34,12 @@ class Model:
     revision: str = ""
     licence: str = ""
 
+    @property
+    def line(self) -> str:
+        """For the log."""
+        revision = f"revision {self.revision}" if self.revision else ""
+        return ", ".join(part for part in (self.name, revision, self.licence) if part)
+
 
 @dataclass(frozen=True)
 class Origin:
@@ -46,7 +52,7 @@ class Origin:
     @property
     def line(self) -> str:
         """For the log."""
-        model = f" ({self.model.name}, revision {self.model.revision}, {self.model.licence})" if self.model else ""
+        model = "" if self.model is None else f" ({self.model.line})"
         return f"{self.provider}{model}: {self.why}"
 
     def entry(self) -> dict[str, str]:
