@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from lerobot_msdyn.core.cli import EXIT_OK, EXIT_SOME_EPISODES_FAILED, parse_config, run_command
 from lerobot_msdyn.core.errors import ConfigError, DatasetError, OutputError, PriorError
 from lerobot_msdyn.core.fields import between, one_of
-from lerobot_msdyn.core.files import cache_folder
+from lerobot_msdyn.core.files import cache_folder, write_whole
 
 if TYPE_CHECKING:
     import numpy as np
@@ -164,7 +164,7 @@ def _pictures(source: Any, key: str, chosen: dict[int, list[int]]) -> "np.ndarra
 
     pictures = []
     for index, frames in chosen.items():
-        rgb = read_colour(source, index, key, read_rows(source, index))[frames].numpy()
+        rgb = read_colour(source, index, key, read_rows(source, index), frames).numpy()
         height, width = rgb.shape[1:3]
         size = (min(width, WIDTH), round(height * min(1.0, WIDTH / width)))
         pictures += [cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in rgb]
@@ -172,7 +172,7 @@ def _pictures(source: Any, key: str, chosen: dict[int, list[int]]) -> "np.ndarra
 
 
 def _values(
-    mapping: "JointMap", states: dict[int, "np.ndarray"], chosen: dict[int, list[int]], fps: float
+    mapping: "JointMap", states: dict[int, "np.ndarray"], chosen: dict[int, list[int]], fps: int | float
 ) -> tuple["np.ndarray", "np.ndarray"]:
     """Values of the joints in the chosen frames, and their change per second."""
     import numpy as np
@@ -299,11 +299,8 @@ def _show(robot: "Robot", verdict: "Verdict", frames: "np.ndarray", values: "np.
 
 
 def _write(path: Path, content: dict[str, Any]) -> None:
-    part = path.with_name(f".{path.name}.part")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text(json.dumps(content, indent=1))
-        part.replace(path)
+        write_whole(path, json.dumps(content, indent=1).encode())
     except OSError as error:
         raise OutputError(f"{path} cannot be written ({error}); choose another place by --out") from error
 

@@ -78,7 +78,7 @@ def open_cache(setting: str, rgb: UInt8[Tensor, "t h w 3"]) -> PriorCache:
     """The cache of a video under the folder that the setting names: `auto`, `off`, or the folder itself."""
     if setting in _OFF:
         return PriorCache(None)
-    folder = default_folder() if setting == "auto" else Path(setting).expanduser()
+    folder = cache_folder("priors") if setting == "auto" else Path(setting).expanduser()
     return PriorCache(folder / digest_of(rgb))
 
 
@@ -86,11 +86,6 @@ def digest_of(images: UInt8[Tensor, "t h w *c"]) -> str:
     """A digest of images and their size."""
     pixels = np.ascontiguousarray(images.cpu().numpy())
     return _digest(str(pixels.shape).encode(), pixels.data)
-
-
-def default_folder() -> Path:
-    """LEROBOT_MSDYN_CACHE if it is set, else lerobot_msdyn/priors in the user's cache folder."""
-    return cache_folder("priors")
 
 
 def _read(path: Path) -> Arrays | None:

@@ -32,7 +32,7 @@ class RobotRecord:
         }
         return {"urdf": str(self.urdf), "licence": self.licence, "joints": joints, "lag_s": self.lag_s}
 
-    def values(self, state: Float[ndarray, "t s"], fps: float) -> Float64[ndarray, "t j"]:
+    def values(self, state: Float[ndarray, "t s"], fps: int | float) -> Float64[ndarray, "t j"]:
         """Values of the movable joints (rad, m) at the moments that the frames show."""
         values = self.mapping.values(state)
         rate = np.gradient(values, 1 / fps, axis=0) if len(values) > 1 else np.zeros_like(values)
