@@ -1,5 +1,5 @@
 # make demo    set everything up and run the main job on a small synthetic dataset
-# make test    set everything up and run the tests: the quick ones with shapes checked at every call, then the slow ones
+# make test    set everything up and run the tests
 # make lint    formatting, lint and types
 unexport PYTHONDONTWRITEBYTECODE  # torch and lerobot compiled anew at every start would cost more than the tests
 .PHONY: setup demo test lint clean
@@ -23,8 +23,7 @@ demo: setup
 	$(BIN)/python examples/01_demo.py
 
 test: setup
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not slow' $(TESTS) || test $$? -eq 5
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m slow -o addopts='--strict-markers -ra' $(TESTS) || test $$? -eq 5
+	$(BIN)/python -m pytest -n 2 --dist loadfile $(TESTS)
 
 lint: setup
 	$(BIN)/ruff check .
