@@ -1,13 +1,14 @@
 # make demo    set everything up and run the main job on a small synthetic dataset
 # make test    set everything up and run the tests
 # make lint    formatting, lint and types
+unexport PYTHONDONTWRITEBYTECODE  # torch and lerobot compiled anew at every start would cost more than the tests
 .PHONY: setup demo test lint clean
 
 PYTHON ?= $(shell command -v python || command -v python3)
 UV := $(shell command -v uv || echo .tools/bin/uv)
 VENV := .venv
 BIN := $(VENV)/bin
-EXTRAS := cuda,viz,priors,sfm,evaluate,dev
+EXTRAS := cuda,viz,priors,sfm,robots,evaluate,dev
 TESTS ?= tests
 
 setup: $(VENV)/.ready
@@ -15,7 +16,7 @@ setup: $(VENV)/.ready
 $(VENV)/.ready: pyproject.toml constraints.txt
 	@command -v $(UV) >/dev/null || $(PYTHON) -m pip install --quiet --target .tools uv
 	@test -x $(BIN)/python || $(UV) venv --quiet --python 3.12 $(VENV)
-	$(UV) pip install --quiet --python $(BIN)/python --constraint constraints.txt --editable '.[$(EXTRAS)]'
+	$(UV) pip install --quiet --compile-bytecode --python $(BIN)/python --constraint constraints.txt --editable '.[$(EXTRAS)]'
 	@touch $@
 
 demo: setup

@@ -43,7 +43,7 @@ from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.files import write_whole
 from lerobot_msdyn.evaluate.metrics import masked_psnr_db
 from lerobot_msdyn.priors import Priors, estimate_priors
-from lerobot_msdyn.reconstruction.background import EmptyScene, empty_scene, look_at_distance
+from lerobot_msdyn.reconstruction.background import EmptyScene, empty_scene
 from lerobot_msdyn.reconstruction.fit import fit
 from lerobot_msdyn.reconstruction.reconstruct import Draft, reconstruct, with_steps
 from lerobot_msdyn.reconstruction.result import Reconstruction
@@ -140,7 +140,7 @@ def reconstructed(prepared: Prepared, row: Row, recipe: Recipe) -> Reconstructio
         draft.priors = prepared.priors
 
     def given_background(draft: Draft) -> None:
-        draft.empty, draft.distance = prepared.empty, look_at_distance(prepared.empty.depth)
+        draft.stand_before(prepared.empty)
 
     def fitted(draft: Draft) -> None:
         scene = draft.scene

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 EXAMPLES = sorted((Path(__file__).parent.parent / "examples").glob("*.py"))
 IN_CI = "01_demo.py"  # make demo
 SAYS = {
@@ -29,7 +31,6 @@ def test_examples_are_numbered_and_short(path: Path) -> None:
     assert len(path.read_text().splitlines()) < 80
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("path", [path for path in EXAMPLES if path.name != IN_CI], ids=lambda path: path.stem)
 def test_example_runs(path: Path, tmp_path: Path) -> None:
     small = ["--out", str(tmp_path), "--frames", "8", "--steps", "4"]

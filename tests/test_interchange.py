@@ -27,6 +27,8 @@ from lerobot_msdyn.dataset.rows import read_rows
 from lerobot_msdyn.dataset.write import NewEpisode, OutputDataset
 from lerobot_msdyn.split import split_by_source
 
+pytestmark = pytest.mark.slow
+
 FRONT = "observation.images.front"
 
 

@@ -161,6 +161,8 @@ def augment(
         skipped = one_line_each(source.repo_id, failures) + _lost(config, source)
         dropped = [f"episode {e.source_index} variant {e.provenance.variant}: {e.dropped}" for e in made if e.dropped]
         left_out = [f"skipped: {line}" for line in skipped] + [f"dropped: {line}" for line in dropped]
+        if not cameras:
+            left_out.append("no new views: no camera stands still, and the recorded episodes are copied as they are")
         if not new:
             first = [*skipped, *dropped][0]
             raise EpisodeError(f"no episode could be augmented; nothing was written. First: {first}")
@@ -172,9 +174,10 @@ def augment(
         output.finish(new, recipe_text(config), left_out, report)
     accounts = accounts_of(entries_of(made)[0])
     rendered = sum(episode.provenance.variant != SOURCE_VARIANT for episode in new)
+    of_cameras = f" ({config.variants} per episode, {', '.join(cameras)})" if cameras else ""
     return _say_skipped(
-        f"{len(episodes) - len(failures)} of {len(episodes)} episodes, {rendered} new ones "
-        f"({config.variants} per episode, {', '.join(cameras)}), {time.perf_counter() - start:.0f} s\n"
+        f"{len(episodes) - len(failures)} of {len(episodes)} episodes, {rendered} new ones{of_cameras}, "
+        f"{time.perf_counter() - start:.0f} s\n"
         f"{''.join(f'{camera}: {account_line(account)}{chr(10)}' for camera, account in accounts.items())}"
         f"{units_of_shifts([episode.provenance.perturbation for episode in made])}"
         f"written to {new_root}\n"

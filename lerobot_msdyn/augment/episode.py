@@ -67,7 +67,7 @@ def augment_episode(
         noted[key] = Noted(found.lines(), _displaced_px(source, key, episode.views[key]))
         if noted[key].defects:
             logger.warning("%s episode %d, %s: %s", source.repo_id, index, key, "; ".join(noted[key].defects))
-    other = _other_pose(recipe, index, episode.views[cameras[0]])
+    other = _other_pose(recipe, index, episode.views[cameras[0]]) if cameras else None
     kept = output.episode(index)
     scenes = {}
     for key, view in episode.views.items():
@@ -88,7 +88,7 @@ def augment_episode(
     new = []
     if recipe.include_source:
         new.append(NewEpisode(index, Provenance(source.repo_id, index, SOURCE_VARIANT, recipe.seed, {}, priors)))
-    for variant in range(recipe.variants):
+    for variant in range(recipe.variants if cameras else 0):
         progress(f"episode {index}: rendering variant {variant}", 0.0)
         make_episode = functools.partial(_rendered, source, index, variant, recipe, output, ready, noted, other)
         new.append(kept.keep(f"variant_{variant:02d}", make_episode))
@@ -153,7 +153,7 @@ def _accepted(
 def _displaced_px(source: LeRobotDatasetMetadata, key: str, view: View) -> float | None:
     """By how much a camera's first frame is displaced against that of the dataset (px of 320); None: unknown."""
     try:
-        first = read_colour(source, 0, key, read_rows(source, 0).slice(0, 1))[0]
+        first = read_colour(source, 0, key, read_rows(source, 0), [0])[0]
     except EpisodeError:
         return None
     found = displacement_px(first, view.rgb[0])

@@ -32,17 +32,19 @@ def still_cameras(
 ) -> list[str]:
     """Those of the cameras that stand still, judged by the first episode that can be read.
 
-    The others are left out, with the reason.
+    The others are copied as they are, with the reason.
 
     Raises:
-        DatasetError: one that the recipe names moves, or no camera is left.
+        DatasetError: one that the recipe names moves, or no camera is left and recorded episodes are not asked for.
         EpisodeError: none of the episodes can be read.
     """
     episode = _first_readable(source, episodes, cameras, recipe)
     moving = {key: reason for key in cameras if (reason := why_moving(episode, key))}
+    refused = recipe.cameras is not None or (len(moving) == len(cameras) and not recipe.include_source)
     for key, reason in moving.items():
-        message = f"{source.repo_id}: {key} is refused: {reason} (--allow_moving re-renders it all the same)"
-        if recipe.cameras is not None or len(moving) == len(cameras):
+        message = f"{source.repo_id}: {key} is {'refused' if refused else 'copied'}: {reason}"
+        message += " (--allow_moving true re-renders it all the same)"
+        if refused:
             raise DatasetError(message)
         logger.warning(message)
     return [key for key in cameras if key not in moving]

@@ -34,7 +34,7 @@ def read_recorded(
     depth = recipe.priors.reads_recorded_depth if recorded_depth is None else recorded_depth
     episode = read_episode(source, index, list(cameras), recipe.camera, recorded_depth=depth)
     defects = {
-        key: find_defects(view.rgb, episode.state, _last_picture(source, index - 1, key))
+        key: find_defects(view.rgb, episode.state, last_picture(source, index - 1, key))
         for key, view in episode.views.items()
     }
     for key, found in defects.items():
@@ -46,10 +46,10 @@ def read_recorded(
     return replace(episode, views={key: repaired(view, defects[key]) for key, view in episode.views.items()}), defects
 
 
-def _last_picture(source: LeRobotDatasetMetadata, index: int, key: str) -> UInt8[Tensor, "1 h w 3"] | None:
-    """The last picture of an episode, if there is such an episode and it can be read."""
+def last_picture(source: LeRobotDatasetMetadata, index: int, key: str) -> UInt8[Tensor, "1 h w 3"] | None:
+    """The last picture of an episode; none where there is no such episode or it cannot be read."""
     if index >= 0:
         with contextlib.suppress(EpisodeError):
             rows = read_rows(source, index)
-            return read_colour(source, index, key, rows.slice(len(rows) - 1))
+            return read_colour(source, index, key, rows, [len(rows) - 1])
     return None

@@ -124,7 +124,8 @@ def _make(work: Work, index: int) -> Callable[[], list[NewEpisode]]:
 def plan(source: LeRobotDatasetMetadata, episodes: list[int], cameras: list[str], config: AugmentConfig) -> str:
     """What a run would do: episodes, pictures, disk and time, the last by doing a little of it."""
     frames = sum(int(source.episodes[index]["length"]) for index in episodes)
-    copies = config.variants + int(config.include_source)
+    variants = config.variants if cameras else 0
+    copies = variants + int(config.include_source)
     disk = predicted_output_bytes(source, episodes, config)
     count = workers_for(config, frames, len(episodes))
     with threads_of_one(count):
@@ -133,9 +134,9 @@ def plan(source: LeRobotDatasetMetadata, episodes: list[int], cameras: list[str]
     scenes = predicted_scene_bytes(speeds, source, episodes, config) if config.save_scenes else 0.0
     with_scenes = f", {scenes / 1e6:.0f} MB of it saved scenes" if scenes else ""
     return (
-        f"{source.repo_id}: {len(episodes)} episodes, {frames} frames; re-rendering {', '.join(cameras)}\n"
-        f"{config.variants} new per episode: {len(episodes) * copies} episodes, {frames * copies} frames, "
-        f"{frames * config.variants * len(cameras)} new pictures\n"
+        f"{source.repo_id}: {len(episodes)} episodes, {frames} frames; re-rendering {', '.join(cameras) or 'nothing'}\n"
+        f"{variants} new per episode: {len(episodes) * copies} episodes, {frames * copies} frames, "
+        f"{frames * variants * len(cameras)} new pictures\n"
         f"about {(disk + scenes) / 1e6:.0f} MB on disk{with_scenes}, and about {seconds / 60:.1f} minutes "
         f"on this machine, by {count} {'process' if count == 1 else 'processes'}, judging by a few frames and steps\n"
     )
@@ -143,6 +144,8 @@ def plan(source: LeRobotDatasetMetadata, episodes: list[int], cameras: list[str]
 
 def _say_what_is_assumed(source: LeRobotDatasetMetadata, cameras: list[str], config: AugmentConfig) -> None:
     """Once per run: what nobody measured."""
+    if not cameras:
+        return
     logger.info("%s: re-rendering %s", source.repo_id, ", ".join(cameras))
     if config.camera.calibration is None:
         logger.warning(

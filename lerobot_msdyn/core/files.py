@@ -12,6 +12,7 @@ from lerobot_msdyn.core.errors import OutputError
 
 DISK_FAULTS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG}
 BLOCK_BYTES = 1 << 20
+CACHE_VARIABLE = "LEROBOT_MSDYN_CACHE"
 DIGEST_BYTES = 16
 
 
@@ -61,6 +62,14 @@ def temporary_files_in(folder: Path) -> Iterator[None]:
         yield
     finally:
         tempfile.tempdir = before
+
+
+def cache_folder(stage: str) -> Path:
+    """LEROBOT_MSDYN_CACHE if it is set, else the stage's folder in lerobot_msdyn/ of the user's cache folder."""
+    if os.environ.get(CACHE_VARIABLE):
+        return Path(os.environ[CACHE_VARIABLE]).expanduser()
+    home = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return Path(home).expanduser() / "lerobot_msdyn" / stage
 
 
 def digest_of_file(path: Path) -> str:

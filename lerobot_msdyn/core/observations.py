@@ -34,6 +34,12 @@ class Model:
     revision: str = ""
     licence: str = ""
 
+    @property
+    def line(self) -> str:
+        """For the log."""
+        revision = f"revision {self.revision}" if self.revision else ""
+        return ", ".join(part for part in (self.name, revision, self.licence) if part)
+
 
 @dataclass(frozen=True)
 class Origin:
@@ -46,7 +52,7 @@ class Origin:
     @property
     def line(self) -> str:
         """For the log."""
-        model = f" ({self.model.name}, revision {self.model.revision}, {self.model.licence})" if self.model else ""
+        model = "" if self.model is None else f" ({self.model.line})"
         return f"{self.provider}{model}: {self.why}"
 
     def entry(self) -> dict[str, str]:
@@ -88,6 +94,27 @@ class Priors:
 
 
 @dataclass(frozen=True)
+class RobotSeen:
+    """What a robot's joints say of a video, by a calibration in whose world z points up."""
+
+    depth: Float[Tensor, "t h w"]  # m, z-depth of the robot; 0 = none is there
+    moving: Bool[Tensor, "t h w"]  # pixels of links that move during the episode
+    ground_m: float  # height of what the robot stands on, in the world
+    model: Model = Model()  # its description
+
+    def select(self, frames: slice | Int[Tensor, " s"]) -> "RobotSeen":
+        """The same at some of its frames."""
+        return replace(self, depth=self.depth[frames], moving=self.moving[frames])
+
+    def resized(self, width: int, height: int) -> "RobotSeen":
+        """The same with another number of pixels (the nearest ones)."""
+        size = (width, height)
+        depth = [cv2.resize(image, size, interpolation=cv2.INTER_NEAREST) for image in self.depth.numpy()]
+        moving = [cv2.resize(image, size, interpolation=cv2.INTER_NEAREST) for image in self.moving.byte().numpy()]
+        return replace(self, depth=torch.from_numpy(np.stack(depth)), moving=torch.from_numpy(np.stack(moving)).bool())
+
+
+@dataclass(frozen=True)
 class View:
     """What one camera recorded."""
 
@@ -95,6 +122,7 @@ class View:
     camera: CameraTrack
     depth: Float[Tensor, "t h w"] | None = None  # m, z-depth; as recorded, see `depth_range`
     depth_range: tuple[float, float] = (0.0, float("inf"))  # m; values at the ends mean "not measured"
+    robot: RobotSeen | None = None  # where its calibration names a robot
 
     def __len__(self) -> int:
         return self.rgb.shape[0]
@@ -102,7 +130,8 @@ class View:
     def select(self, frames: slice | Int[Tensor, " s"]) -> "View":
         """The video at some of its frames."""
         depth = None if self.depth is None else self.depth[frames]
-        return replace(self, rgb=self.rgb[frames], camera=self.camera.select(frames), depth=depth)
+        robot = None if self.robot is None else self.robot.select(frames)
+        return replace(self, rgb=self.rgb[frames], camera=self.camera.select(frames), depth=depth, robot=robot)
 
     def shrunk(self, max_width: int) -> "View":
         """The same video with at most `max_width` columns; depth keeps its values (nearest pixel)."""
@@ -115,4 +144,5 @@ class View:
         if self.depth is not None:
             images = [cv2.resize(image, size, interpolation=cv2.INTER_NEAREST) for image in self.depth.numpy()]
             depth = torch.from_numpy(np.stack(images))
-        return View(torch.from_numpy(rgb), self.camera.resized(*size), depth, self.depth_range)
+        robot = None if self.robot is None else self.robot.resized(*size)
+        return View(torch.from_numpy(rgb), self.camera.resized(*size), depth, self.depth_range, robot)

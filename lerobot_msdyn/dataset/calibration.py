@@ -14,6 +14,7 @@ from lerobot_msdyn.core.cameras import CameraTrack, intrinsics_from_fov, static_
 from lerobot_msdyn.core.config import CameraConfig
 from lerobot_msdyn.core.errors import PriorError
 from lerobot_msdyn.core.geometry import invert_se3, se3
+from lerobot_msdyn.robots.calibration.record import RobotRecord, read_record
 
 
 def make_camera(key: str, index: int, rgb: UInt8[Tensor, "t h w 3"], config: CameraConfig) -> CameraTrack:
@@ -37,11 +38,11 @@ def read_calibration(path: Path, camera: str, episode: int, frames: int, width: 
     Raises:
         PriorError: the file cannot be read or an entry has the wrong shape.
     """
+    content = _content(path)
     try:
-        content = json.loads(path.read_text())
         section = content.get("episodes", {}).get(str(episode), content)
         cameras: dict[str, Any] = dict(section.get("cameras", {}))
-    except (OSError, ValueError, AttributeError, TypeError) as error:
+    except (ValueError, AttributeError, TypeError) as error:
         raise PriorError(
             f"{path}: calibration cannot be read ({error}); expected a JSON file with the cameras by name, see "
             "docs/calibration.md"
@@ -59,6 +60,26 @@ def read_calibration(path: Path, camera: str, episode: int, frames: int, width: 
         ) from error
     world_from_camera = invert_se3(se3(rotation, translation)).float()
     return replace(static_camera(intrinsics, frames, width, height, world_from_camera), origin="calibration")
+
+
+def read_robot(path: Path) -> RobotRecord | None:
+    """The robot of a calibration file, whose root's frame is the cameras' world; None if it names none.
+
+    Raises:
+        PriorError: the file cannot be read, or its entry `robot` cannot be used.
+    """
+    entry = _content(path).get("robot")
+    return None if entry is None else read_record(entry, path)
+
+
+def _content(path: Path) -> dict[str, Any]:
+    try:
+        return dict(json.loads(path.read_text()))
+    except (OSError, ValueError, TypeError) as error:
+        raise PriorError(
+            f"{path}: calibration cannot be read ({error}); expected a JSON file with the cameras by name, see "
+            "docs/calibration.md"
+        ) from error
 
 
 def _names(camera: str) -> list[str]:

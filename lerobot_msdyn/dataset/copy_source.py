@@ -69,10 +69,10 @@ def _stats(source: LeRobotDatasetMetadata, index: int, key: str, rows: pa.Table)
     """Statistics of one feature's pictures, from sampled frames."""
     chosen = sample_indices(rows.num_rows)
     if key in source.depth_keys:
-        depth, _ = read_depth(source, index, key, rows)
-        samples = depth[chosen][:, None].numpy() * depth_units_per_metre(source, key)
+        depth, _ = read_depth(source, index, key, rows, chosen)
+        samples = depth[:, None].numpy() * depth_units_per_metre(source, key)
         return image_stats(np.stack([auto_downsample_height_width(sample) for sample in samples]), 1.0)
     channels = picture_size(source.features[key])[2] if key in source.image_keys else 3
-    frames = read_colour(source, index, key, rows)[chosen].numpy()
+    frames = read_colour(source, index, key, rows, chosen).numpy()
     pictures = [np.atleast_3d(with_channels(frame, channels)).transpose(2, 0, 1) for frame in frames]
     return image_stats(np.stack([auto_downsample_height_width(picture) for picture in pictures]))

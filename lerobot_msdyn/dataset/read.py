@@ -5,7 +5,7 @@ import itertools
 import logging
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,10 +22,12 @@ from lerobot.datasets.depth_utils import dequantize_depth
 from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, OBS_STATE
 from torch import Tensor
 
+from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.config import CameraConfig
 from lerobot_msdyn.core.errors import DatasetError, EpisodeError, first_line
-from lerobot_msdyn.core.observations import View
-from lerobot_msdyn.dataset.calibration import make_camera
+from lerobot_msdyn.core.files import cache_folder
+from lerobot_msdyn.core.observations import RobotSeen, View
+from lerobot_msdyn.dataset.calibration import make_camera, read_robot
 from lerobot_msdyn.dataset.checks import IntactEpisodes, check_metadata, picture_size, read_json
 from lerobot_msdyn.dataset.chroma import is_subsampled, restore_chroma
 from lerobot_msdyn.dataset.features import completed
@@ -38,6 +40,8 @@ from lerobot_msdyn.dataset.video_index import (
     frame_numbers,
     index_of,
 )
+from lerobot_msdyn.robots import load_robot
+from lerobot_msdyn.robots.seen import robot_seen
 
 logger = logging.getLogger(__name__)
 
@@ -168,6 +172,7 @@ def read_episode(
     """
     rows = read_rows(meta, index)
     time = torch.from_numpy(on_grid(rows, meta.fps)["timestamp"].to_numpy().astype(np.float32))
+    state = _matrix(rows, OBS_STATE)
     views = {}
     for key in cameras:
         rgb = read_colour(meta, index, key, rows)
@@ -181,16 +186,31 @@ def read_episode(
                     f"its camera {tuple(rgb.shape[1:3])}; "
                     "only depth that is aligned to the colour image can be used (--priors.depth plane goes without)"
                 )
-        views[key] = View(rgb, make_camera(key, index, rgb, config), depth, depth_range)
+        camera = make_camera(key, index, rgb, config)
+        robot = _robot(config, camera, state, meta.fps)
+        views[key] = View(rgb, camera, depth, depth_range, robot)
     return Episode(
         source=EpisodeSource(meta.repo_id, meta.root, index),
         fps=meta.fps,
         time=time - time[0],
         views=views,
-        state=_matrix(rows, OBS_STATE),
+        state=state,
         action=_matrix(rows, ACTION),
         task=task_of(meta, rows),
     )
+
+
+def _robot(
+    config: CameraConfig, camera: CameraTrack, state: Float[Tensor, "t s"] | None, fps: int | float
+) -> RobotSeen | None:
+    """What a calibrated camera sees of the robot, where the calibration names one."""
+    if config.calibration is None or camera.origin != "calibration" or state is None:
+        return None
+    record = read_robot(config.calibration)
+    if record is None:
+        return None
+    robot = load_robot(record.urdf, record.licence, cache_folder("robots"))
+    return robot_seen(robot, record, state, fps, camera, config.calibration)
 
 
 def depth_key_of(meta: LeRobotDatasetMetadata, camera: str) -> str | None:
@@ -198,22 +218,31 @@ def depth_key_of(meta: LeRobotDatasetMetadata, camera: str) -> str | None:
     return next((key for key in meta.depth_keys if key == f"{camera}_depth"), None)
 
 
-def read_colour(meta: LeRobotDatasetMetadata, index: int, key: str, rows: pa.Table) -> UInt8[Tensor, "t h w 3"]:
-    """All frames of one colour camera; chroma that was recorded at half the size is restored (`chroma`).
+def read_colour(
+    meta: LeRobotDatasetMetadata, index: int, key: str, rows: pa.Table, frames: Sequence[int] | None = None
+) -> UInt8[Tensor, "t h w 3"]:
+    """Frames of one colour camera; chroma that was recorded at half the size is restored (`chroma`).
+
+    Args:
+        meta: the dataset.
+        index: the episode.
+        key: feature key of the camera.
+        rows: all rows of the episode.
+        frames: which frames, ascending; default: all.
 
     Raises:
         EpisodeError: a frame is absent or cannot be decoded.
     """
     if key in meta.video_keys:
-        return _decode_video(meta, index, key, rows)
-    images = [_decode_image(meta, index, key, item, cv2.IMREAD_COLOR_RGB) for item in rows[key].to_pylist()]
+        return _decode_video(meta, index, key, rows, frames)
+    images = [_decode_image(meta, index, key, item, cv2.IMREAD_COLOR_RGB) for item in _images(rows, key, frames)]
     return torch.from_numpy(np.stack(images))
 
 
 def read_depth(
-    meta: LeRobotDatasetMetadata, index: int, key: str, rows: pa.Table
+    meta: LeRobotDatasetMetadata, index: int, key: str, rows: pa.Table, frames: Sequence[int] | None = None
 ) -> tuple[Float[Tensor, "t h w"], tuple[float, float]]:
-    """All frames of one recorded depth camera in metres, and the range whose ends mean "not measured".
+    """Frames of one recorded depth camera in metres, and the range whose ends mean "not measured"; as `read_colour`.
 
     Raises:
         EpisodeError: a frame is absent or cannot be decoded.
@@ -232,9 +261,9 @@ def read_depth(
             )
             return depth[:, 0].float()
 
-        depth = _decode_video(meta, index, key, rows, in_metres)
+        depth = _decode_video(meta, index, key, rows, frames, in_metres)
         return depth, (encoder.depth_min, encoder.depth_max)
-    images = [_decode_image(meta, index, key, item, cv2.IMREAD_UNCHANGED) for item in rows[key].to_pylist()]
+    images = [_decode_image(meta, index, key, item, cv2.IMREAD_UNCHANGED) for item in _images(rows, key, frames)]
     depth = torch.from_numpy(np.stack(images).astype(np.float32))
     return depth / depth_units_per_metre(meta, key), (0.0, float("inf"))
 
@@ -277,13 +306,16 @@ def _decode_video(
     index: int,
     key: str,
     rows: pa.Table,
+    chosen: Sequence[int] | None,
     in_metres: Callable[[Tensor], Tensor] | None = None,
 ) -> Tensor:
-    """All frames of a video: colours [t,h,w,3], or what is made of the depth codes of some at a time [b,1,h,w].
+    """Frames of a video: colours [t,h,w,3], or what is made of the depth codes of some at a time [b,1,h,w].
 
     Worked on in blocks, so that a video is in memory once.
     """
     video, numbers = find_frames(meta, index, key, rows)
+    if chosen is not None:
+        numbers = [numbers[frame] for frame in chosen]
     pictures = decoded(video, numbers, is_depth=in_metres is not None)
     restored = restore_chroma if is_subsampled(video.pix_fmt) else Tensor.contiguous
     frames: Tensor | None = None
@@ -302,6 +334,11 @@ def _decode_video(
     if frames is None:
         raise EpisodeError(f"{meta.repo_id} episode {index}, {key}: the episode has no frames")
     return frames
+
+
+def _images(rows: pa.Table, key: str, frames: Sequence[int] | None) -> list[Any]:
+    """What the rows of some frames hold of an image feature."""
+    return list((rows if frames is None else rows.take(list(frames)))[key].to_pylist())
 
 
 def _decode_image(meta: LeRobotDatasetMetadata, index: int, key: str, item: Any, flags: int) -> np.ndarray:

@@ -24,13 +24,12 @@ import numpy as np
 from jaxtyping import UInt8
 from torch import Tensor
 
-from lerobot_msdyn.core.files import digest_of_file
+from lerobot_msdyn.core.files import CACHE_VARIABLE, cache_folder, digest_of_file
 
 logger = logging.getLogger(__name__)
 
 Arrays = dict[str, np.ndarray]
 
-ENVIRONMENT = "LEROBOT_MSDYN_CACHE"
 _DIGEST = 16  # bytes
 _OFF = ("off", "False")  # YAML reads off as false
 
@@ -70,7 +69,7 @@ class PriorCache:
                 path,
                 error,
                 prior,
-                ENVIRONMENT,
+                CACHE_VARIABLE,
             )
         return arrays
 
@@ -79,7 +78,7 @@ def open_cache(setting: str, rgb: UInt8[Tensor, "t h w 3"]) -> PriorCache:
     """The cache of a video under the folder that the setting names: `auto`, `off`, or the folder itself."""
     if setting in _OFF:
         return PriorCache(None)
-    folder = default_folder() if setting == "auto" else Path(setting).expanduser()
+    folder = cache_folder("priors") if setting == "auto" else Path(setting).expanduser()
     return PriorCache(folder / digest_of(rgb))
 
 
@@ -87,14 +86,6 @@ def digest_of(images: UInt8[Tensor, "t h w *c"]) -> str:
     """A digest of images and their size."""
     pixels = np.ascontiguousarray(images.cpu().numpy())
     return _digest(str(pixels.shape).encode(), pixels.data)
-
-
-def default_folder() -> Path:
-    """LEROBOT_MSDYN_CACHE if it is set, else lerobot_msdyn/priors in the user's cache folder."""
-    if os.environ.get(ENVIRONMENT):
-        return Path(os.environ[ENVIRONMENT]).expanduser()
-    home = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(home).expanduser() / "lerobot_msdyn" / "priors"
 
 
 def _read(path: Path) -> Arrays | None:

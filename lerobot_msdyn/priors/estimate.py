@@ -15,6 +15,7 @@ from lerobot_msdyn.priors.from_file import CameraFile, DepthFile, MaskFile, Trac
 from lerobot_msdyn.priors.provide import provide
 from lerobot_msdyn.priors.registry import CameraProvider, DepthProvider, MaskProvider, Masks, TrackProvider
 from lerobot_msdyn.priors.request import Request
+from lerobot_msdyn.priors.robot import with_robot, with_robot_depth
 from lerobot_msdyn.render.devices import chosen_device
 
 logger = logging.getLogger(__name__)
@@ -53,6 +54,8 @@ def estimate_priors(
     pinhole, camera_from = provide(
         CameraProvider, camera.poses, request, lambda provider: provider.estimate(request, instances), file=CameraFile
     )
+    if view.robot is not None:
+        instances = with_robot(instances, view.robot.moving)
     posed = replace(request, view=replace(view, camera=pinhole))
     depth, depth_from = provide(
         DepthProvider, config.depth, posed, lambda provider: provider.estimate(posed, instances), file=DepthFile
@@ -60,9 +63,13 @@ def estimate_priors(
     tracks, tracks_from = provide(
         TrackProvider, config.tracks, posed, lambda provider: provider.estimate(posed, instances), file=TrackFile
     )
+    if view.robot is not None:
+        depth = with_robot_depth(depth, view.robot.depth)
     if camera.fov_search:
         pinhole, camera_from = with_searched_fov(pinhole, tracks, depth)
     origins = {"camera": camera_from, "masks": masks_from, "depth": depth_from, "tracks": tracks_from}
+    if view.robot is not None:
+        origins["robot"] = Origin("calibration", "its links in masks and depth, by the joints", view.robot.model)
     counts = {"masks": f", {int(instances.max())} instances", "tracks": f", {len(tracks)} tracks"}
     for prior, origin in origins.items():
         logger.info("%s: %s%s", prior, origin.line, counts.get(prior, ""))

@@ -68,6 +68,16 @@ class Draft:
     self_check: SelfCheck = field(init=False)
     seconds: dict[str, float] = field(default_factory=dict)  # by step
 
+    def stand_before(self, empty: EmptyScene) -> None:
+        """Take what stands still as given, and how the camera stands to it."""
+        self.empty = empty
+        self.distance = look_at_distance(empty.depth)
+        if self.view.robot is None:
+            self.up = up_of(empty.depth, self.view.camera.intrinsics[0], self.recipe.camera.tilt_deg)
+        else:  # its world's z axis
+            x, y, z = self.view.camera.camera_from_world[0, :3, 2].tolist()
+            self.up = x, y, z
+
     def window(self, start: int) -> FittedWindow:
         """What all steps have made, on the host."""
         scene, evidence = to_device((self.scene, self.evidence), "cpu")
@@ -98,9 +108,7 @@ def _priors(draft: Draft) -> None:
 def _background(draft: Draft) -> None:
     """What the camera sees where nothing moves, and how it stands to it."""
     empty = empty_scene(draft.view.rgb, draft.priors.depth, draft.priors.instances)
-    draft.empty = empty if draft.shared is None else completed(empty, draft.shared.empty, len(draft.view))
-    draft.distance = look_at_distance(draft.empty.depth)
-    draft.up = up_of(draft.empty.depth, draft.view.camera.intrinsics[0], draft.recipe.camera.tilt_deg)
+    draft.stand_before(empty if draft.shared is None else completed(empty, draft.shared.empty, len(draft.view)))
 
 
 def _initial_scene(draft: Draft) -> None:

@@ -18,6 +18,8 @@ from lerobot.datasets import LeRobotDataset
 from lerobot_msdyn.augment import run as job
 from lerobot_msdyn.augment import workers
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def augmented(desk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -6,11 +6,14 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import torch
 from augment_command import FAST, FRONT, run
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from panned import HEIGHT, WIDTH, along, panned
 
 from lerobot_msdyn.dataset.provenance import TABLE
+
+pytestmark = pytest.mark.slow
 
 FRAMES = 24
 WAYS = {
@@ -69,7 +72,23 @@ def test_every_episode_says_where_its_camera_stood(
     assert f"{FRONT}, episode 4: it moves" in page
 
 
-def test_the_first_episode_decides_which_cameras_stand(moved: Path, tmp_path: Path) -> None:
-    arguments = ("--repo=local/moved", f"--root={moved}", f"--new_root={tmp_path / 'new'}", "--episodes=[4]")
-    assert run(*arguments, *FAST) == 2
-    assert not (tmp_path / "new").exists()
+def test_where_no_camera_stands_still_the_recorded_episodes_are_copied(
+    moved: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    out = tmp_path / "new"
+    arguments = ("--repo=local/moved", f"--root={moved}", f"--new_root={out}", "--episodes=[4]")
+    assert run(*arguments, *FAST, "--include_source=false") == 2
+    assert not out.exists()
+    assert "re-rendering nothing" in plan_of(*arguments, capfd=capfd)
+    assert run(*arguments, *FAST) == 1
+    assert f"{FRONT} is copied: its background moves by" in caplog.text
+    assert "no new views: no camera stands still" in capfd.readouterr().out
+    copy, recorded = (LeRobotDataset("local/moved", root) for root in (out, moved))
+    assert len(copy) == FRAMES
+    assert torch.equal(copy[FRAMES - 1][FRONT], recorded[5 * FRAMES - 1][FRONT])
+    assert (out / "report.html").is_file()
+
+
+def plan_of(*arguments: str, capfd: pytest.CaptureFixture[str]) -> str:
+    assert run(*arguments, *FAST, "--dry_run=true") == 0
+    return capfd.readouterr().out

@@ -85,8 +85,11 @@ def on_the_arm(desk: Path, monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def test_an_episode_that_cannot_be_read_lets_no_camera_pass(desk: Path, on_the_arm: list[int]) -> None:
     source = open_source("local/desk", desk)
     with pytest.raises(DatasetError, match=r"top is refused: its background moves.*does not stand still"):
-        still_cameras(source, [0, 1, 2], ["top"], Recipe())
-    assert on_the_arm == [0, 1]
+        still_cameras(source, [0, 1, 2], ["top"], Recipe(include_source=False))
+    assert still_cameras(source, [1], ["top"], Recipe()) == []
+    with pytest.raises(DatasetError, match="top is refused"):
+        still_cameras(source, [1], ["top"], Recipe(cameras=["top"]))
+    assert on_the_arm[:2] == [0, 1]
 
 
 def test_where_no_episode_can_be_read_no_camera_passes(desk: Path, on_the_arm: list[int]) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 from augment_command import FAST, FRONT, run
+from barcodes import code_of, record
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_msdyn.augment import recorded
@@ -45,3 +46,12 @@ def test_an_episode_that_is_mostly_blank_is_refused(desk: Path, monkeypatch: pyt
     monkeypatch.setattr(recorded, "read_episode", spoiled)
     with pytest.raises(EpisodeError, match=r"episode 0, .*front: 8 of 12 frames are blank"):
         recorded.read_recorded(open_source("local/desk", desk), 0, [FRONT], Recipe())
+
+
+def test_the_picture_before_an_episode_is_the_last_of_the_one_before(tmp_path: Path) -> None:
+    (first, _) = record(tmp_path / "bars", [6, 8])
+    source = open_source("local/bars", tmp_path / "bars")
+    last = recorded.last_picture(source, 0, FRONT)
+    assert last is not None
+    assert code_of(last[0]) == first[-1]
+    assert recorded.last_picture(source, -1, FRONT) is None

@@ -27,6 +27,8 @@ from lerobot_msdyn.core.registries import DEPTH
 from lerobot_msdyn.dataset.read import open_source
 from lerobot_msdyn.dataset.write import OutputDataset
 
+pytestmark = pytest.mark.slow
+
 FAST = (
     "--fit.steps",
     "8",

@@ -13,6 +13,8 @@ import torch
 
 from lerobot_msdyn.core.cameras import CameraTrack, intrinsics_from_fov, static_camera
 
+pytestmark = pytest.mark.slow
+
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 TINY = ["--steps", "4", "--width", "64", "--frames", "12", "--every", "6", "--kinds", "push", "--seeds", "0"]
 

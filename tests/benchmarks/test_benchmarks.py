@@ -17,6 +17,8 @@ from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.motion.model.compose import compose
 from lerobot_msdyn.synthetic import make_scene
 
+pytestmark = pytest.mark.slow
+
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
 
@@ -123,8 +125,8 @@ def test_the_gpu_benchmark_runs_on_the_cpu(
 ) -> None:
     monkeypatch.syspath_prepend(BENCHMARKS)
     gpu = importlib.import_module("gpu")
-    sizes = ["--workloads", "W3", "--parity", "W3", "--frames", "24", "--width", "96", "--height", "72"]
-    small = ["--device", "cpu", "--recipe", "quick", "--steps", "6", "--episodes", "2"]
+    sizes = ["--workloads", "W3", "--parity", "W3", "--frames", "12", "--width", "96", "--height", "72"]
+    small = ["--device", "cpu", "--recipe", "quick", "--steps", "4", "--episodes", "2"]
     gpu.main([*small, *sizes, "--json", str(tmp_path / "gpu.json")])
     rows = json.loads((tmp_path / "gpu.json").read_text())
     assert {row["part"] for row in rows} == set(gpu.PARTS)

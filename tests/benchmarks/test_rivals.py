@@ -27,6 +27,8 @@ from lerobot_msdyn.scene.gaussians import Gaussians, rgb_to_sh
 from lerobot_msdyn.scene.store import load_scene, save_scene
 from lerobot_msdyn.synthetic.bodies import TrackedBody, tracked_body
 
+pytestmark = pytest.mark.slow
+
 PROJECT = Path(__file__).parents[2]
 
 

@@ -15,6 +15,8 @@ from lerobot_msdyn.evaluate import __main__ as evaluate
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.nvs import write_nvs_folder
 
+pytestmark = pytest.mark.slow
+
 FAST = ("--fit.steps", "20", "--scene.moving_frames", "6")
 
 
@@ -66,7 +68,6 @@ def unchanged_psnr(folder: Path, camera: str) -> float:
     return float(10 * np.log10(255**2 / ((recorded - true) ** 2).mean()))
 
 
-@pytest.mark.slow
 def test_what_moves_is_scored_with_and_without_overlay(whole: Path, tmp_path: Path) -> None:
     for overlay, out in (("true", tmp_path / "with"), ("false", tmp_path / "without")):
         assert run("nvs", "--scene", str(whole), "--out", str(out), "--scene.overlay", overlay, *FAST) == 0
@@ -84,7 +85,6 @@ def test_what_moves_is_scored_with_and_without_overlay(whole: Path, tmp_path: Pa
     assert motion["what_moves"]["by_overlay"] == 0
 
 
-@pytest.mark.slow
 def test_views_are_close_to_the_true_ones(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("nvs", "--scene", str(folder), "--out", str(tmp_path), *FAST) == 0
     printed = capsys.readouterr().out

@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import torch
 
-from lerobot_msdyn.motion.to_video.alignment import Sightings, Video, align
+from lerobot_msdyn.core.cameras import intrinsics_from_fov, static_camera
+from lerobot_msdyn.motion.to_video.alignment import Sightings, Video, align, read_video
 from lerobot_msdyn.motion.to_video.regroup import Grouping
 
 
@@ -39,3 +40,10 @@ def test_sightings_lie_on_what_moves(video: Video, points: Sightings) -> None:
     away = points.xyz - video.camera.world_from_camera[points.frame, :3, 3]
     assert bool(((away * points.normals).sum(-1) < 0).all())
     torch.testing.assert_close(points.normals.norm(dim=-1), torch.ones(len(points)))
+
+
+def test_without_any_mask_all_is_as_far_outside_as_can_be() -> None:
+    camera = static_camera(intrinsics_from_fov(48, 36, 60.0), 1, 48, 36)
+    nothing = torch.zeros(1, 36, 48, dtype=torch.uint8)
+    video = read_video(torch.zeros(1, 36, 48, 3, dtype=torch.uint8), torch.ones(1, 36, 48), nothing, camera, 0.002)
+    assert (video.maps.outside >= 254).all()

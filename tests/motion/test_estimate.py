@@ -15,6 +15,8 @@ from lerobot_msdyn.motion.model.scene_motion import SceneMotion
 from lerobot_msdyn.priors import PointTracks
 from lerobot_msdyn.synthetic.bodies import TrackedBody, tracked_body
 
+pytestmark = pytest.mark.slow
+
 K = torch.tensor([[100.0, 0.0, 32.0], [0.0, 100.0, 24.0], [0.0, 0.0, 1.0]])
 
 

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from lerobot_msdyn.core.files import cache_folder
 from lerobot_msdyn.core.plugins import _from_file
 from lerobot_msdyn.priors import cache as cache_module
-from lerobot_msdyn.priors.cache import PriorCache, default_folder, open_cache, save_npz
+from lerobot_msdyn.priors.cache import PriorCache, open_cache, save_npz
 
 RGB = torch.randint(0, 255, (3, 8, 8, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
 
@@ -88,10 +89,10 @@ def test_off_keeps_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_the_environment_names_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LEROBOT_MSDYN_CACHE", str(tmp_path / "mine"))
-    assert default_folder() == tmp_path / "mine"
+    assert cache_folder("priors") == tmp_path / "mine"
     monkeypatch.delenv("LEROBOT_MSDYN_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert default_folder() == tmp_path / "lerobot_msdyn" / "priors"
+    assert cache_folder("priors") == tmp_path / "lerobot_msdyn" / "priors"
 
 
 def test_a_file_appears_whole_or_not_at_all(tmp_path: Path) -> None:

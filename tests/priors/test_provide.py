@@ -98,6 +98,7 @@ def test_a_new_provider_takes_part_in_auto_by_its_rank() -> None:
     DEPTH.add("lidar", Lidar)
     value, origin = depth()
     assert origin == Origin("lidar", "there is a lidar; by echo", Model("me/lidar", licence="MIT"))
+    assert origin.line == "lidar (me/lidar, MIT): there is a lidar; by echo"
     assert origin.entry() == {
         "provider": "lidar",
         "why": "there is a lidar; by echo",

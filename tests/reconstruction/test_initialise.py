@@ -21,6 +21,8 @@ from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.gaussians import gaussians_from_points
 from lerobot_msdyn.synthetic import make_scene
 
+pytestmark = pytest.mark.slow
+
 FRAMES, WIDTH, HEIGHT = 16, 80, 60
 
 

@@ -18,6 +18,8 @@ from lerobot_msdyn.reconstruction.reconstruct import reconstruct
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.views.pictures import Picture, new_pictures
 
+pytestmark = pytest.mark.slow
+
 FRAMES, WIDTH, HEIGHT = 12, 64, 48
 
 

@@ -28,6 +28,8 @@ from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.views.gate import judge
 from lerobot_msdyn.views.pictures import coverages, new_pictures, on_device
 
+pytestmark = pytest.mark.slow
+
 FRAMES, WIDTH, HEIGHT = 12, 32, 24
 STEPS = 52  # held-out frames are looked at every 50 steps
 SQUARE = (slice(8, 16), slice(10, 20))

@@ -16,6 +16,8 @@ from lerobot_msdyn.training import MixedViews
 from lerobot_msdyn.views.perturbations.jitter import Jitter
 from lerobot_msdyn.views.perturbations.orbit import Orbit
 
+pytestmark = pytest.mark.slow
+
 FRONT, SIDE = "observation.images.front", "observation.images.side"
 DEPTH = f"{FRONT}_depth"
 WINDOW = {FRONT: [-0.1, 0.0], DEPTH: [-0.1, 0.0], "action": [0.0, 1 / 30]}
@@ -96,7 +98,6 @@ def test_a_sample_depends_on_seed_epoch_and_index(desk: Path, desk_scenes: Path)
     assert torch.equal(some[2][FRONT], mixed[14][FRONT]), "by the index in the whole dataset"
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")
 @pytest.mark.parametrize(("workers", "context"), [(1, "fork"), (2, "spawn"), (4, "fork")])
 def test_workers_change_nothing(desk: Path, desk_scenes: Path, workers: int, context: str) -> None:

@@ -41,7 +41,8 @@ def train(root: Path, folder: Path, views: str | None, *flags: str) -> subproces
     package = folder / "spy_plugin"
     package.mkdir(exist_ok=True)
     (package / "__init__.py").write_text(SPY)
-    environment = os.environ | {"PYTHONPATH": str(folder), "SPY_FILE": str(folder / "batches.pt")}
+    path = os.pathsep.join([str(folder), *filter(None, [os.environ.get("PYTHONPATH")])])
+    environment = os.environ | {"PYTHONPATH": path, "SPY_FILE": str(folder / "batches.pt")}
     if views is not None:
         environment["LEROBOT_MSDYN_VIEWS"] = views
     command = [

@@ -27,6 +27,8 @@ from lerobot_msdyn.core.perturbation import PERTURBATIONS, Perturbation
 from lerobot_msdyn.training import MixedViews
 from lerobot_msdyn.views.perturbations.orbit import Orbit
 
+pytestmark = pytest.mark.slow
+
 PLUGIN = Path(__file__).parents[2] / "examples" / "03_own_perturbation.py"
 FRONT = "observation.images.front"
 FAST = {
@@ -58,12 +60,18 @@ def augmented(desk: Path, out: Path, flags: list[str]) -> list[np.ndarray]:
     return [np.array(json.loads(row["views"])[FRONT]["camera_from_source"]) for row in rows]
 
 
+def turns_deg(poses: np.ndarray) -> np.ndarray:
+    """By how much each of the poses [t,4,4] is turned, positive to the left."""
+    angles = np.degrees(np.arccos((np.trace(poses[:, :3, :3], axis1=1, axis2=2) - 1) / 2))
+    return np.asarray(np.sign(poses[:, 0, 2]) * angles)
+
+
 def test_one_file_is_a_kind_of_its_own(desk: Path, tmp_path: Path, plugin: list[str]) -> None:
     flags = [*plugin, "--variants", "2", "--perturbation.azimuth_deg", "10"]
     swings = augmented(desk, tmp_path / "new", flags)
     assert [swing.shape for swing in swings] == [(12, 4, 4)] * 2
     for swing in swings:
-        turns = np.degrees(np.arctan2(swing[:, 0, 2], swing[:, 0, 0]))
+        turns = turns_deg(swing)
         assert 9 < np.abs(turns).max() < 10.01
         assert turns.min() < -5
         assert turns.max() > 5
@@ -78,8 +86,7 @@ def test_one_file_is_a_kind_of_its_own(desk: Path, tmp_path: Path, plugin: list[
 
 def test_with_per_frame_every_frame_has_its_own_sample(desk: Path, tmp_path: Path, plugin: list[str]) -> None:
     (poses,) = augmented(desk, tmp_path / "new", [*plugin, "--variants", "1", "--perturbation.per_frame", "true"])
-    turns = np.degrees(np.arctan2(poses[:, 0, 2], poses[:, 0, 0]))
-    assert sorted(np.floor((turns + 15) / 30 * 4).astype(int).tolist()) == sorted([0, 1, 2, 3] * 3)
+    assert sorted(np.floor((turns_deg(poses) + 15) / 30 * 4).astype(int).tolist()) == sorted([0, 1, 2, 3] * 3)
 
 
 def test_flags_are_checked_and_explained(plugin: list[str]) -> None:
@@ -156,7 +163,6 @@ def test_other_processes_import_the_plugin_first(plugin: list[str]) -> None:
         assert pool.submit(azimuth_of, swing).result() == 7.0
 
 
-@pytest.mark.slow
 def test_from_the_command_line_with_several_workers(desk: Path, tmp_path: Path) -> None:
     flags = {"repo": "local/desk", "root": desk, "new_root": tmp_path / "new", "episodes": "[0,1]", "workers": 2}
     flags |= FAST | {"cameras": "[front]", "variants": 1, "plugins": PLUGIN, "perturbation.type": "swing"}

@@ -74,10 +74,9 @@ def read_video(
     for t, (picture, z, labels) in enumerate(zip(rgb.numpy(), depth.numpy(), instances.numpy(), strict=True)):
         reliable[t] = (cv2.erode((z > 0).astype(np.uint8), window) > 0) & ~near_depth_edge(z)
         grey[t] = cv2.GaussianBlur(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (0, 0), 1.0)
-        distance = cv2.distanceTransform((labels == 0).astype(np.uint8), cv2.DIST_L2, 5) / scaled_px(1, labels.shape[1])
-        outside[t] = (
-            np.minimum(distance, 255 / OUTSIDE_UNIT) * OUTSIDE_UNIT
-        )  # without any label the distance is infinite
+        distance = cv2.distanceTransform((labels == 0).astype(np.uint8), cv2.DIST_L2, 5)
+        unit = OUTSIDE_UNIT / scaled_px(1, labels.shape[1])
+        outside[t] = np.minimum(distance, 255 / unit) * unit  # without any label the distance is the largest float
     maps = Maps(depth.numpy(), reliable, grey, outside, camera.intrinsics.float().contiguous().numpy(), pixel_m)
     return Video(maps, instances, camera)
 

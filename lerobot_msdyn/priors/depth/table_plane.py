@@ -8,6 +8,9 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.geometry import unproject_image
+
 _WALL = 3.0  # distance of the wall behind the table, in distances to the table at the image's centre
 _LOWEST = 0.98  # quantile of an instance's rows where it touches the table; the very last ones may be stray pixels
 _SMOOTH_FRAMES = 9  # of the temporal smoothing of an instance's distance
@@ -22,13 +25,31 @@ def table_plane_depth(
     has one depth per frame, that of the table under its lowest rows, smoothed over time. Plausible, not metric: what
     is lifted off the table, or hides its own foot, is put too far away or too near.
     """
-    frames, height, width = instances.shape
+    _, height, width = instances.shape
     tilt = math.radians(tilt_deg)
     y = (torch.arange(height) + 0.5 - intrinsics[1, 2].cpu()) / intrinsics[1, 1].cpu()
     descent = y * math.cos(tilt) + math.sin(tilt)  # of a ray, per metre of z
     wall = _WALL * height_m / math.sin(tilt)
     rows = torch.where(descent > height_m / wall, height_m / descent.clamp(min=1e-6), wall)
-    depth = rows[None, :, None].repeat(frames, 1, width)
+    return _with_standing(rows[:, None].repeat(1, width), instances)
+
+
+def ground_depth(instances: UInt8[Tensor, "t h w"], camera: CameraTrack, ground_m: float) -> Float[Tensor, "t h w"]:
+    """As `table_plane_depth`, for a fixed camera that is known to stand over the ground (z up, m)."""
+    _, height, width = instances.shape
+    pose = camera.world_from_camera[0]
+    rays = unproject_image(torch.ones(height, width), camera.intrinsics[0])
+    descent = -(rays @ pose[2, :3])  # per metre of z
+    above = (pose[2, 3] - ground_m).clamp(min=1e-3)
+    centre = descent[height // 2, width // 2].clamp(min=0.1)
+    wall = _WALL * above / centre
+    ground = torch.where(descent > above / wall, above / descent.clamp(min=1e-6), wall)
+    return _with_standing(ground, instances)
+
+
+def _with_standing(ground: Float[Tensor, "h w"], instances: UInt8[Tensor, "t h w"]) -> Float[Tensor, "t h w"]:
+    """Depth of the ground, and of the things that stand on it."""
+    depth, rows = ground.repeat(len(instances), 1, 1), ground.median(dim=1).values
     for instance in range(1, int(instances.max()) + 1):
         mask = instances == instance
         if bool(mask.any()):

@@ -1,21 +1,29 @@
 """Depth without a sensor or learned weights: everything stands on a table."""
 
 from lerobot_msdyn.core.observations import DepthTraits
-from lerobot_msdyn.priors.depth.table_plane import table_plane_depth
+from lerobot_msdyn.priors.depth.table_plane import ground_depth, table_plane_depth
 from lerobot_msdyn.priors.registry import DEPTH, Depth, DepthProvider, Estimate, Masks
 from lerobot_msdyn.priors.request import Request
+from lerobot_msdyn.priors.robot import RELATIVE_ERROR
 
 
 @DEPTH.register("plane")
 class Plane(DepthProvider):
-    """A table at the height and tilt that `camera.height_m` and `camera.tilt_deg` state; can always be used."""
+    """A table at the height and tilt that `camera.height_m` and `camera.tilt_deg` state, or under a calibrated robot.
+
+    It can always be used.
+    """
 
     rank = 10
     reads_recorded_depth = False
     is_reference = True
 
     def estimate(self, request: Request, instances: Masks) -> Estimate[Depth]:
-        """Assumed, not measured."""
+        """Assumed, not measured, but where a robot stands on the table."""
+        if request.view.robot is not None:
+            z = ground_depth(instances, request.view.camera, request.view.robot.ground_m)
+            traits = DepthTraits(metric=True, relative_error=RELATIVE_ERROR)
+            return Estimate(Depth(z, traits), "the table that the robot stands on")
         height_m, tilt_deg = request.camera.height_m, request.camera.tilt_deg
         z = table_plane_depth(instances, request.view.camera.intrinsics[0], height_m, tilt_deg)
         traits = DepthTraits(sharp=True, relative_error=0.10, assumed=True)

@@ -1,0 +1,167 @@
+"""The camera, refined: outlines of the links slide onto the edges of what moves (Gauss-Newton, Cauchy loss)."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64
+from numpy import ndarray
+
+from lerobot_msdyn.robots.calibration.contours import Outline, Posed, edges_across, jacobian, sampled, signed_distance
+from lerobot_msdyn.robots.calibration.search import Pose
+from lerobot_msdyn.robots.description import Robot
+
+KNOWN = 0.99
+MOST_POINTS = 9000  # of all outlines, in one step
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Standard deviations of what is assumed before anything is seen."""
+
+    offset_deg: float = 1.5  # of each joint's zero
+    scale: float = 0.02  # of each joint's unit, relative
+    lag_s: float = 0.03  # of the state behind the video
+    grown_px: float = 0.5  # by which masks are larger than what they show
+    log_focal: float = 0.4
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A camera, and corrections of the joints."""
+
+    pose: Pose
+    offset: Float64[ndarray, " j"]  # rad, or m
+    scale: Float64[ndarray, " j"]
+    lag_s: float = 0.0
+    grown_px: float = 0.0
+    covariance: Float64[ndarray, "7 7"] | None = None  # of `Pose.moved`
+
+    def values(self, values: Float64[ndarray, "t j"], rate: Float64[ndarray, "t j"]) -> Float64[ndarray, "t j"]:
+        """Corrected values of the joints."""
+        return (values + self.lag_s * rate) * self.scale + self.offset
+
+
+class Problem:
+    """Frames, the joints in them, and the edges of what moves."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        values: Float64[ndarray, "t j"],
+        rate: Float64[ndarray, "t j"],
+        distance: Float32[ndarray, "t h w"],
+        spread: Spread,
+        known: Float32[ndarray, "t h w"] | None = None,
+        difference: Float32[ndarray, "t h w"] | None = None,
+    ) -> None:
+        self.robot, self.values, self.rate, self.distance, self.spread = robot, values, rate, distance, spread
+        self.known = known  # 1 where masks and differences can be relied on
+        self.difference = difference  # to the empty scene, CIE Lab units
+        self.size = (distance.shape[2], distance.shape[1])
+        span = np.ptp(values, axis=0)
+        active = span > np.radians(1.5)
+        self.moving = (robot.moved_by & active).any(1)
+        # What turns everything that moves cannot be told from a turn of the camera.
+        self.fixed = robot.moved_by[self.moving].all(0) | ~robot.moved_by[self.moving].any(0)
+
+    def with_masks(self, masks: Bool[ndarray, "t h w"], known: Bool[ndarray, "h w"]) -> "Problem":
+        """The same with other masks, which are to be relied on in some pixels alone."""
+        distance, where = signed_distance(masks), np.broadcast_to(known, masks.shape).astype(np.float32)
+        return Problem(self.robot, self.values, self.rate, distance, self.spread, where)
+
+    def with_difference(self, difference: Float32[ndarray, "t h w"], known: Bool[ndarray, "h w"]) -> "Problem":
+        """The same with edges of pictures' differences to the empty scene, instead of masks."""
+        where = np.broadcast_to(known, difference.shape).astype(np.float32)
+        return Problem(self.robot, self.values, self.rate, self.distance, self.spread, where, difference)
+
+    def observed(
+        self, frames: Int64[ndarray, " k"], points: Outline
+    ) -> tuple[Float64[ndarray, " n"], Float64[ndarray, "n 2"], Bool[ndarray, " n"]]:
+        """Distance of an outline to the masks' edges (px), its slope, and whether it can be relied on."""
+        value, slope = sampled(self.distance[frames], points.frame, points.xy)
+        if self.known is None:
+            return value, slope, np.ones(len(value), bool)
+        known, _ = sampled(self.known[frames], points.frame, points.xy)
+        if self.difference is None:
+            return value, slope, known > KNOWN
+        value, usable = edges_across(self.difference[frames], points, self.size[0] / 320)
+        return value, points.normal, usable & (known > KNOWN)
+
+
+def refined(
+    problem: Problem,
+    start: Solution,
+    frames: Int64[ndarray, " k"],
+    rounds: int,
+    scale_px: tuple[float, float],
+    joints: bool = True,
+) -> Solution:
+    """A solution after some rounds; the outlines are drawn anew in each."""
+    solution = start
+    for number in range(rounds):
+        share = number / max(rounds - 1, 1)
+        width = scale_px[0] * (scale_px[1] / scale_px[0]) ** share
+        solution = _step(problem, solution, frames, width, joints)
+    return solution
+
+
+def _step(
+    problem: Problem, solution: Solution, frames: Int64[ndarray, " k"], scale_px: float, joints: bool
+) -> Solution:
+    values = solution.values(problem.values[frames], problem.rate[frames])
+    posed = Posed(problem.robot, values)
+    points = posed.outline(solution.pose, problem.size, problem.moving).thinned(MOST_POINTS)
+    if len(points) < 50:
+        return solution
+    value, slope, known = problem.observed(frames, points)
+    by_pose, by_joints = jacobian(posed, solution.pose, points, problem.size[0])
+    steep = np.einsum("ni,nij->nj", slope, by_pose)
+    turned = np.einsum("ni,nij->nj", slope, by_joints)
+    state, rate = problem.values[frames][points.frame], problem.rate[frames][points.frame]
+    residual = value + solution.grown_px
+    weight = known / (1 + (residual / scale_px) ** 2)
+    columns = [steep, np.ones((len(points), 1))]
+    spread, count = problem.spread, by_joints.shape[2]
+    prior = [0.0] * 6 + [1 / spread.log_focal, 1 / spread.grown_px]
+    at = [0.0] * 6 + [float(np.log(solution.pose.focal / 0.9)), solution.grown_px]
+    if joints:
+        free = ~problem.fixed
+        columns += [turned * free, turned * free * (state - state.mean(0)), (turned * rate).sum(1, keepdims=True)]
+        prior += [1 / np.radians(spread.offset_deg)] * count + [1 / spread.scale] * count + [1 / spread.lag_s]
+        offset = solution.offset + (solution.scale - 1) * problem.values.mean(0)
+        at += [*offset, *(solution.scale - 1), solution.lag_s]
+    design, strength = np.concatenate(columns, 1), np.array(prior)
+    # Neighbouring points of an outline are wrong together: about ten of them are one measurement, of half a pixel.
+    precision = 1 / (10 * 0.5**2)
+    normal = precision * (design * weight[:, None]).T @ design
+    right = -precision * (design * weight[:, None]).T @ residual - strength**2 * np.array(at)
+    normal += np.diag(strength**2)
+    step = np.linalg.solve(normal + np.diag(1e-9 * np.diag(normal) + 1e-12), right)
+    covariance = np.linalg.inv(normal + 1e-9 * np.eye(len(normal)) * np.diag(normal).max() * 1e-6)[:7, :7]
+    pose, grown = solution.pose.moved(step[:7]), solution.grown_px + step[7]
+    if not joints:
+        return replace(solution, pose=pose, grown_px=grown, covariance=covariance)
+    d_offset, d_scale, d_lag = step[8 : 8 + count], step[8 + count : 8 + 2 * count], step[-1]
+    mean = problem.values[frames].mean(0)
+    return Solution(
+        pose,
+        solution.offset + d_offset - d_scale * mean,
+        solution.scale + d_scale,
+        solution.lag_s + float(d_lag),
+        float(grown),
+        covariance,
+    )
+
+
+def hits(problem: Problem, solution: Solution, frames: Int64[ndarray, " k"], within_px: float = 1.5) -> float:
+    """Share of the outline within some pixels (of a picture 320 wide) of an edge."""
+    posed = Posed(problem.robot, solution.values(problem.values[frames], problem.rate[frames]))
+    points = posed.outline(solution.pose, problem.size, problem.moving)
+    if not len(points):
+        return 0.0
+    value, _, told = problem.observed(frames, points)
+    hit = told & (np.abs(value + solution.grown_px) < within_px * problem.size[0] / 320)
+    known = len(points)
+    if problem.known is not None:
+        known = int((sampled(problem.known[frames], points.frame, points.xy)[0] > KNOWN).sum())
+    return float(hit.sum() / max(known, 1))

@@ -1,0 +1,159 @@
+"""The command: from a dataset and a description to a calibration file that the other commands read."""
+
+import json
+from pathlib import Path
+
+import augment_command as augment
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+from filmed_arm import FRONT, HEIGHT, NAMES, WIDTH, camera, write_filmed
+
+from lerobot_msdyn import calibrate
+from lerobot_msdyn.core.config import CameraConfig, PriorsConfig
+from lerobot_msdyn.core.errors import ConfigError, DatasetError, PriorError
+from lerobot_msdyn.dataset.provenance import TABLE
+from lerobot_msdyn.dataset.read import open_source, read_episode
+from lerobot_msdyn.priors import estimate_priors
+from lerobot_msdyn.robots import Robot
+
+POSE = camera(-50, 25, 0.9, 50)
+
+
+@pytest.fixture(scope="module")
+def recorded(arm: Robot, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_filmed(tmp_path_factory.mktemp("filmed") / "arm", arm, POSE)
+
+
+def command(root: Path, urdf: Path, out: Path, *more: str) -> int:
+    flags = ("--repo=local/arm", f"--root={root}", f"--robot.urdf={urdf}", f"--out={out}")
+    return calibrate.run([*flags, *more])
+
+
+def record(urdf: Path, out: Path, **changes: object) -> Path:
+    """The calibration file that is right."""
+    joints = {name: {"column": k, "scale": float(np.pi / 180), "offset": 0.0} for k, name in enumerate(NAMES[:5])} | {
+        "gripper": {"column": 5, "scale": 0.016, "offset": -0.2}
+    }
+    focal = POSE.focal * WIDTH
+    content = {
+        "cameras": {
+            "front": {
+                "K": [[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]],
+                "R": POSE.rotation.tolist(),
+                "t": POSE.translation.tolist(),
+            }
+        },
+        "robot": {"urdf": str(urdf), "licence": "as its author gives it", "joints": joints, "lag_s": 0.0} | changes,
+    }
+    out.write_text(json.dumps(content))
+    return out
+
+
+@pytest.mark.slow
+def test_from_dataset_to_calibration(
+    recorded: Path, urdf: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "new" / "arm.json"
+    assert command(recorded, urdf, out) == 0
+    content = json.loads(out.read_text())
+    entry = content["cameras"][FRONT]
+    assert np.array(entry["R"]) == pytest.approx(POSE.rotation, abs=0.02)
+    assert np.array(entry["t"]) == pytest.approx(POSE.translation, abs=0.03)
+    assert entry["K"][0][0] == pytest.approx(POSE.focal * WIDTH, rel=0.03)
+    assert np.array(entry["covariance"]).shape == (7, 7)
+    assert (out.parent / "arm_front.png").exists()
+    assert "of the outlines on edges" in capsys.readouterr().out
+    episode = read_episode(open_source("local/arm", recorded), 0, [FRONT], CameraConfig(calibration=out))
+    assert episode.views[FRONT].camera.origin == "calibration"
+    assert episode.views[FRONT].robot is not None
+
+
+@pytest.mark.parametrize(
+    ("flags", "error", "expected"),
+    [
+        (["--robot.urdf=/absent/arm.urdf"], ConfigError, "/absent/arm.urdf: the robot's description cannot be read"),
+        (["--robot.joints={a: shoulder}"], ConfigError, "expected joints of arm"),
+        (["--robot.units=gradians"], ConfigError, "robot.units is 'gradians'"),
+        (["--frames=3"], ConfigError, "frames is 3"),
+    ],
+)
+def test_bad_input_is_one_line_and_nothing_is_written(
+    recorded: Path, urdf: Path, tmp_path: Path, flags: list[str], error: type[Exception], expected: str
+) -> None:
+    with pytest.raises(error, match=expected):
+        command(recorded, urdf, tmp_path / "c.json", *flags)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_poses_of_the_hand_are_refused(arm: Robot, urdf: Path, tmp_path: Path) -> None:
+    names = ("x", "y", "z", "rx", "ry", "rz")
+    root = write_filmed(tmp_path / "hand", arm, POSE, 1, 12, names)
+    with pytest.raises(ConfigError, match="inverse kinematics is not done"):
+        command(root, urdf, tmp_path / "c.json")
+
+
+def test_too_few_frames_are_refused(arm: Robot, urdf: Path, tmp_path: Path) -> None:
+    root = write_filmed(tmp_path / "short", arm, POSE, 1, 5)
+    with pytest.raises(DatasetError, match="5 frames; expected at least 12"):
+        command(root, urdf, tmp_path / "c.json")
+
+
+def test_the_arm_and_its_table_are_priors(recorded: Path, urdf: Path, tmp_path: Path) -> None:
+    config = CameraConfig(calibration=record(urdf, tmp_path / "c.json"))
+    view = read_episode(open_source("local/arm", recorded), 0, [FRONT], config).views[FRONT].select(slice(0, 8))
+    assert view.robot is not None
+    assert view.robot.ground_m == pytest.approx(0, abs=1e-3)
+    priors = estimate_priors(view, PriorsConfig(depth="plane", cache="off"), config)
+    arm = view.robot.depth > 0
+    assert torch.equal(priors.depth[arm], view.robot.depth[arm])
+    assert priors.metric
+    assert priors.provenance["robot"]["model"] == "arm"
+    assert priors.provenance["robot"]["licence"] == "as its author gives it"
+    moving = view.robot.moving
+    assert priors.instances[moving].unique().numel() == 1
+    assert int(priors.instances[moving].unique()) > 0
+    # Where the table is seen, its points lie at the height of the base.
+    row, column = HEIGHT - 2, 3
+    ray = torch.tensor([(column + 0.5 - WIDTH / 2), (row + 0.5 - HEIGHT / 2), POSE.focal * WIDTH]).double()
+    point = ray / ray[2] * float(priors.depth[0, row, column])
+    height = (torch.from_numpy(POSE.rotation.T) @ (point - torch.from_numpy(POSE.translation)))[2]
+    assert float(height) == pytest.approx(0, abs=2e-3)
+
+
+def test_a_smaller_picture_shows_the_same_arm(recorded: Path, urdf: Path, tmp_path: Path) -> None:
+    config = CameraConfig(calibration=record(urdf, tmp_path / "c.json"))
+    view = read_episode(open_source("local/arm", recorded), 0, [FRONT], config).views[FRONT]
+    small = view.shrunk(80)
+    assert view.robot is not None
+    assert small.robot is not None
+    assert small.robot.depth.shape == (len(view), 60, 80)
+    share = float((small.robot.depth > 0).float().mean() / (view.robot.depth > 0).float().mean())
+    assert share == pytest.approx(1, abs=0.05)
+
+
+@pytest.mark.slow
+def test_new_views_by_the_arm(recorded: Path, urdf: Path, tmp_path: Path) -> None:
+    calibration, out = record(urdf, tmp_path / "c.json"), tmp_path / "new"
+    arguments = ("--repo=local/arm", f"--root={recorded}", f"--new_root={out}", "--episodes=[0]", "--variants=1")
+    more = ("--priors.masks=change", "--priors.depth=plane", "--gate.enabled=false", "--workers=1")
+    assert augment.run(*arguments, *more, f"--camera.calibration={calibration}", *augment.FAST) == 0
+    row = pq.read_table(out / TABLE).to_pylist()[-1]
+    assert "the table that the robot stands on" in row["priors"]
+    assert "as its author gives it" in row["priors"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"joints": {"pan": {"column": 0, "scale": 1.0, "offset": 0.0}}}, "calibrate again"),
+        ({"joints": {"pan": {}}}, "its entry `robot` cannot be used"),
+    ],
+)
+def test_a_calibration_of_another_robot_is_named(
+    recorded: Path, urdf: Path, tmp_path: Path, changes: dict[str, object], expected: str
+) -> None:
+    config = CameraConfig(calibration=record(urdf, tmp_path / "c.json", **changes))
+    with pytest.raises(PriorError, match=expected):
+        read_episode(open_source("local/arm", recorded), 0, [FRONT], config)
