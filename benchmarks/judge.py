@@ -70,7 +70,7 @@ def unfit_for_training(dataset: LeRobotDataset) -> list[str]:
 
 def _turns_of_source(source: Path, key: str) -> list[int]:
     """The quarter turns that the matrix of each episode's recorded video asks for."""
-    table = pq.read_table(next((source / "meta" / "episodes").rglob("*.parquet")))
+    table = pq.read_table(source / "meta" / "episodes" / "chunk-000" / "file-000.parquet")  # others may be cut off
     files = table[f"videos/{key}/file_index"].to_pylist()
     paths = {number: source / "videos" / key / "chunk-000" / f"file-{number:03d}.mp4" for number in files}
     turns = {number: turns_of(path) if path.exists() else 0 for number, path in paths.items()}

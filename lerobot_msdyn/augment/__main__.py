@@ -4,6 +4,7 @@ python -m lerobot_msdyn.augment --repo local/ds
 """
 
 import logging
+import shutil
 import sys
 import time
 from pathlib import Path
@@ -114,9 +115,11 @@ def _describe(config: AugmentConfig, root: Path) -> dict[str, Any]:
 
 def _describe_opened(config: AugmentConfig, source: "LeRobotDatasetMetadata", episodes: list[int]) -> dict[str, Any]:
     from lerobot_msdyn.augment.backgrounds import background_episodes
+    from lerobot_msdyn.augment.robot_cameras import calibration_episodes
     from lerobot_msdyn.augment.run_identity import describe_run, source_files
 
-    return describe_run(source.root, source_files(source, [*episodes, *background_episodes(source, config)]), config)
+    read = [*episodes, *background_episodes(source, config), *calibration_episodes(source, config)]
+    return describe_run(source.root, source_files(source, read), config)
 
 
 def _convert(
@@ -143,9 +146,10 @@ def augment(
     from lerobot_msdyn.augment.failures import one_line_each
     from lerobot_msdyn.augment.report.build import entries_of, write_report
     from lerobot_msdyn.augment.report.page import accounts_of
+    from lerobot_msdyn.augment.robot_cameras import calibrated
     from lerobot_msdyn.augment.run import run_local
     from lerobot_msdyn.augment.run_identity import recipe_text
-    from lerobot_msdyn.dataset.provenance import SOURCE_VARIANT
+    from lerobot_msdyn.dataset.provenance import CALIBRATION, FOLDER, SOURCE_VARIANT
     from lerobot_msdyn.dataset.write import OutputDataset
     from lerobot_msdyn.reconstruction.account import account_line
     from lerobot_msdyn.views.camera_change import units_of_shifts
@@ -156,7 +160,9 @@ def augment(
     check_disk(source, episodes, config, staging.folder)
     with OutputDataset(source, new_repo_id, new_root, staging, nvenc=config.nvenc) as output:
         output.check(cameras, depth=config.render_depth)
-        made, failures = run_local(source, episodes, cameras, config, output)
+        found = staging.folder / CALIBRATION
+        used = calibrated(source, episodes, cameras, config, found)
+        made, failures = run_local(source, episodes, cameras, used, output)
         new = [episode for episode in made if not episode.dropped]
         skipped = one_line_each(source.repo_id, failures) + _lost(config, source)
         dropped = [f"episode {e.source_index} variant {e.provenance.variant}: {e.dropped}" for e in made if e.dropped]
@@ -168,6 +174,8 @@ def augment(
             raise EpisodeError(f"no episode could be augmented; nothing was written. First: {first}")
 
         def report(folder: Path) -> Path:
+            if found.is_dir():
+                shutil.copytree(found, folder / FOLDER / CALIBRATION)
             seconds = time.perf_counter() - start
             return write_report(source, folder, new_root.name, made, skipped, len(failures), seconds)
 

@@ -98,6 +98,6 @@ def background_episodes(source: LeRobotDatasetMetadata, recipe: Recipe) -> list[
 
 
 def looked_at(episodes: int) -> list[int]:
-    """Indices of those of a dataset's two or more episodes that are looked at."""
+    """Indices of those of a dataset's episodes that are looked at."""
     count = min(MAX_EPISODES, episodes)
-    return sorted({round(i * (episodes - 1) / (count - 1)) for i in range(count)})
+    return sorted({round(i * (episodes - 1) / max(1, count - 1)) for i in range(count)})

@@ -16,8 +16,8 @@ from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import DatasetError, EpisodeError
 from lerobot_msdyn.core.sampling import evenly, scaled_px
 from lerobot_msdyn.dataset.read import Episode
-from lerobot_msdyn.priors.camera.stands import camera_stands
 from lerobot_msdyn.priors.camera.steadiness import SWAY_PX, camera_motion_px
+from lerobot_msdyn.reconstruction.windows import seen_stands
 
 logger = logging.getLogger(__name__)
 
@@ -39,7 +39,7 @@ def still_cameras(
         EpisodeError: none of the episodes can be read.
     """
     episode = _first_readable(source, episodes, cameras, recipe)
-    moving = {key: reason for key in cameras if (reason := why_moving(episode, key))}
+    moving = {key: reason for key in cameras if (reason := why_moving(episode, key, recipe.priors.cache))}
     refused = recipe.cameras is not None or (len(moving) == len(cameras) and not recipe.include_source)
     for key, reason in moving.items():
         message = f"{source.repo_id}: {key} is {'refused' if refused else 'copied'}: {reason}"
@@ -66,14 +66,14 @@ def _first_readable(
     )
 
 
-def why_moving(episode: Episode, key: str) -> str:
+def why_moving(episode: Episode, key: str, cache: str) -> str:
     """Why a camera is not taken to stand still; empty if it is.
 
     Its background goes far from where it was in the first frame, whatever the robot does; or it moves by more than a
-    camera on a stand sways, and the whole picture when the robot does.
+    camera on a stand sways, and the whole picture when the robot does. `cache` is the one of the recipe's priors.
     """
     rgb = episode.views[key].rgb
-    stands = camera_stands(rgb)
+    stands = seen_stands(rgb, cache)
     if stands.moves:
         return stands.reason()
     motion = camera_motion_px(rgb) / scaled_px(1, rgb.shape[2])

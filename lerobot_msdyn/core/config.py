@@ -35,6 +35,8 @@ class CameraConfig:
 
     # JSON file with K (and R, t) of each camera, see docs/calibration.md; without it the camera is taken as fixed.
     calibration: Path | None = None
+    # Whether the robot's joints tell where cameras without a calibration stand, if its description is on this machine.
+    by_robot: bool = True
     # auto (the calibration, else fixed), fixed, sfm (pycolmap, for a moving camera), or an .npz file with K and w2c.
     poses: str = one_of(AUTO, (AUTO,), registry=CAMERAS)
     # Horizontal field of view in degrees, used where no calibration names the camera.
@@ -50,6 +52,20 @@ class CameraConfig:
     def needs_whole_videos(self) -> bool:
         """Whether the poses are found for a whole video: it cannot be fitted part by part."""
         return _needs_whole_videos(self.poses, CAMERAS)
+
+
+@dataclass
+class RobotConfig:
+    """The robot that the cameras film (docs/robots.md)."""
+
+    # Its description (URDF), with the meshes where it names them.
+    urdf: Path | None = None
+    # Its name: so101, or one of the package robot_descriptions; default: by the dataset's robot_type.
+    name: str = ""
+    # Names in observation.state -> joints of the description, where they differ.
+    joints: dict[str, str] = field(default_factory=dict)
+    # Of the state: auto (told from its values), degrees, radians, normalised (-100..100 of each range) or ticks.
+    units: str = one_of("auto", ("auto", "degrees", "radians", "normalised", "ticks"))
 
 
 @dataclass
@@ -271,6 +287,7 @@ class Recipe:
     # Whether a GPU encodes new H.264 and HEVC videos where it can: faster, but not as the source's encoder would.
     nvenc: bool = False
     camera: CameraConfig = field(default_factory=CameraConfig)
+    robot: RobotConfig = field(default_factory=RobotConfig)
     priors: PriorsConfig = field(default_factory=PriorsConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)

@@ -24,6 +24,7 @@ from lerobot_msdyn.core.files import write_whole
 FOLDER = Path("meta") / "msdyn"
 TABLE = FOLDER / "episodes.parquet"
 RECIPE = FOLDER / "recipe.yaml"
+CALIBRATION = "calibration"  # in FOLDER: what the robot's joints say of the cameras
 SOURCE_VARIANT = -1  # the variant of an episode that was copied, not rendered
 
 

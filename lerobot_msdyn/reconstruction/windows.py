@@ -4,6 +4,8 @@ import itertools
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import UInt8
+from torch import Tensor
 
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.observations import View
@@ -39,16 +41,20 @@ def stands_of(view: View, recipe: Recipe) -> Stands:
 
     In one place where it is said to move, or where priors are for the whole video.
     """
-    whole = Stand(0, len(view), 0.0)
     if recipe.needs_whole_videos or not view.camera.is_static:
-        return Stands((whole,))
+        return Stands((Stand(0, len(view), 0.0),))
+    return seen_stands(view.rgb, recipe.priors.cache)
+
+
+def seen_stands(rgb: UInt8[Tensor, "t h w 3"], cache: str) -> Stands:
+    """Where the camera of a video stood, by its pictures alone; its path is kept in the cache."""
 
     def compute() -> dict:
-        path = camera_path(view.rgb)
+        path = camera_path(rgb)
         return {"affines": path.affines, "size": [path.width, path.height]}
 
-    kept = open_cache(recipe.priors.cache, view.rgb).get("path", "corners", {}, compute)
-    return stands_along(CameraPath(kept["affines"], *map(int, kept["size"])), view.rgb)
+    kept = open_cache(cache, rgb).get("path", "corners", {}, compute)
+    return stands_along(CameraPath(kept["affines"], *map(int, kept["size"])), rgb)
 
 
 def whole_stands(view: View, stands: Stands) -> list[Window]:

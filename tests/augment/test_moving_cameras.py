@@ -45,20 +45,20 @@ def test_a_camera_on_the_arm_moves_when_the_state_does() -> None:
     on_arm = episode(path.round(), path[:, None])
     assert on_arm.state is not None
     assert correlation(on_arm.state, on_arm.views["top"].rgb) > 0.8
-    assert "with the robot" in why_moving(on_arm, "top")
-    assert "no state" in why_moving(episode(path.round(), None), "top")
+    assert "with the robot" in why_moving(on_arm, "top", "off")
+    assert "no state" in why_moving(episode(path.round(), None), "top", "off")
 
 
 def test_a_camera_that_stands_or_drifts_by_itself_is_not_refused() -> None:
     path = stop_and_go()
-    assert why_moving(episode(torch.zeros(FRAMES), path[:, None]), "top") == ""
-    assert why_moving(episode(torch.arange(FRAMES) // 6, path[:, None]), "top") == ""
+    assert why_moving(episode(torch.zeros(FRAMES), path[:, None]), "top", "off") == ""
+    assert why_moving(episode(torch.arange(FRAMES) // 6, path[:, None]), "top", "off") == ""
 
 
 def test_a_camera_whose_picture_goes_far_is_refused_whatever_the_state() -> None:
     anything = torch.rand(FRAMES, 1, generator=torch.Generator().manual_seed(0))
     for path in (2 * torch.arange(FRAMES), stop_and_go().round()):
-        assert "does not stand still" in why_moving(episode(path, anything), "top")
+        assert "does not stand still" in why_moving(episode(path, anything), "top", "off")
 
 
 def test_cameras_on_stands_are_kept(desk: Path) -> None:

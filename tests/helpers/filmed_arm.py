@@ -1,5 +1,6 @@
 """A dataset of a made-up arm in front of a textured table, as a fixed camera sees it."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -38,9 +39,15 @@ def pictures(robot: Robot, pose: Pose, state: np.ndarray) -> np.ndarray:
 
 
 def write_filmed(
-    root: Path, robot: Robot, pose: Pose, episodes: int = 2, frames: int = 24, names: tuple[str, ...] = NAMES
+    root: Path,
+    robot: Robot,
+    pose: Pose,
+    episodes: int = 2,
+    frames: int = 24,
+    names: tuple[str, ...] = NAMES,
+    moved_px: Sequence[tuple[int, int]] = (),
 ) -> Path:
-    """Episodes of the arm swinging."""
+    """Episodes of the arm swinging; `moved_px` are those by which pictures begin and end to the side, by episode."""
     dataset = LeRobotDataset.create(
         "local/arm",
         FPS,
@@ -55,7 +62,9 @@ def write_filmed(
     )
     for episode in range(episodes):
         state = swing(frames, episode).astype(np.float32)
-        for row, picture in zip(state, pictures(robot, pose, state), strict=True):
+        begins, ends = moved_px[episode] if moved_px else (0, 0)
+        for t, (row, still) in enumerate(zip(state, pictures(robot, pose, state), strict=True)):
+            picture = np.roll(still, begins if t < frames // 2 else ends, axis=1)
             dataset.add_frame({"observation.state": row, "action": row, FRONT: picture, "task": "swing"})
         dataset.save_episode(parallel_encoding=False)
     dataset.finalize()

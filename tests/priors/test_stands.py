@@ -6,7 +6,7 @@ import torch
 from panned import WIDTH, along, panned
 
 from lerobot_msdyn.priors.camera.path import camera_path, displacement_px, distances_px
-from lerobot_msdyn.priors.camera.stands import Stands, camera_stands
+from lerobot_msdyn.priors.camera.stands import Stands, stands_along
 
 FRAMES = 24
 STILL = np.zeros((FRAMES, 2))
@@ -16,6 +16,10 @@ def sweeping(t: int) -> tuple[int, int]:
     """Half of the picture, to and fro."""
     middle = int(WIDTH / 2 + 70 * np.sin(t / 12))
     return middle - WIDTH // 4, middle + WIDTH // 4
+
+
+def camera_stands(rgb: torch.Tensor) -> Stands:
+    return stands_along(camera_path(rgb), rgb)
 
 
 def is_steady(found: Stands) -> bool:

@@ -9,14 +9,20 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from filmed_arm import FRONT, HEIGHT, NAMES, WIDTH, camera, write_filmed
+from made_up_arms import swing
 
 from lerobot_msdyn import calibrate
+from lerobot_msdyn.augment.config import AugmentConfig
+from lerobot_msdyn.augment.robot_cameras import NAME, Place, RobotCameras, calibrated, places_of
 from lerobot_msdyn.core.config import CameraConfig, PriorsConfig
 from lerobot_msdyn.core.errors import ConfigError, DatasetError, PriorError
-from lerobot_msdyn.dataset.provenance import TABLE
+from lerobot_msdyn.dataset.calibration import read_calibration
+from lerobot_msdyn.dataset.provenance import CALIBRATION, FOLDER, TABLE
 from lerobot_msdyn.dataset.read import open_source, read_episode
 from lerobot_msdyn.priors import estimate_priors
-from lerobot_msdyn.robots import Robot
+from lerobot_msdyn.robots import Robot, map_joints
+from lerobot_msdyn.robots.calibration.refine import Solution
+from lerobot_msdyn.robots.calibration.solve import Verdict
 
 POSE = camera(-50, 25, 0.9, 50)
 
@@ -63,7 +69,7 @@ def test_from_dataset_to_calibration(
     assert np.array(entry["t"]) == pytest.approx(POSE.translation, abs=0.03)
     assert entry["K"][0][0] == pytest.approx(POSE.focal * WIDTH, rel=0.03)
     assert np.array(entry["covariance"]).shape == (7, 7)
-    assert (out.parent / "arm_front.png").exists()
+    assert (out.parent / "arm_links_front.png").exists()
     assert "of the outlines on edges" in capsys.readouterr().out
     episode = read_episode(open_source("local/arm", recorded), 0, [FRONT], CameraConfig(calibration=out))
     assert episode.views[FRONT].camera.origin == "calibration"
@@ -135,13 +141,45 @@ def test_a_smaller_picture_shows_the_same_arm(recorded: Path, urdf: Path, tmp_pa
 
 @pytest.mark.slow
 def test_new_views_by_the_arm(recorded: Path, urdf: Path, tmp_path: Path) -> None:
-    calibration, out = record(urdf, tmp_path / "c.json"), tmp_path / "new"
+    out = tmp_path / "new"
     arguments = ("--repo=local/arm", f"--root={recorded}", f"--new_root={out}", "--episodes=[0]", "--variants=1")
     more = ("--priors.masks=change", "--priors.depth=plane", "--gate.enabled=false", "--workers=1")
-    assert augment.run(*arguments, *more, f"--camera.calibration={calibration}", *augment.FAST) == 0
+    assert augment.run(*arguments, *more, f"--robot.urdf={urdf}", *augment.FAST) == 0
     row = pq.read_table(out / TABLE).to_pylist()[-1]
     assert "the table that the robot stands on" in row["priors"]
     assert "as its author gives it" in row["priors"]
+    content = json.loads((out / FOLDER / CALIBRATION / NAME).read_text())
+    assert np.array(content["cameras"][FRONT]["R"]) == pytest.approx(POSE.rotation, abs=0.02)
+    assert "links_front" in (out / "report.html").read_text()
+
+
+def test_a_robot_that_is_not_known_is_no_obstacle(recorded: Path, tmp_path: Path) -> None:
+    config, source = AugmentConfig(), open_source("local/arm", recorded)
+    source.info.robot_type = "unheard of"
+    assert calibrated(source, [0], [FRONT], config, tmp_path) is config
+    config.robot.name = "unheard of"
+    with pytest.raises(ConfigError, match="unheard of"):
+        calibrated(source, [0], [FRONT], config, tmp_path)
+    config.camera.by_robot = False
+    assert calibrated(source, [0], [FRONT], config, tmp_path) is config
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_each_place_of_a_camera_has_an_entry_or_none(arm: Robot, urdf: Path, tmp_path: Path) -> None:
+    moved = ((0, 0), (12, 12), (0, 0), (0, 12))
+    source = open_source("local/arm", write_filmed(tmp_path / "arm", arm, POSE, 4, 8, moved_px=moved))
+    assert places_of(source, FRONT, range(4)) == [[0, 2], [1]]
+    solution = Solution(POSE, np.zeros(6), np.ones(6))
+    sure, unsure = (Verdict(solution, 0.9, 0.2, doubt, 1.0) for doubt in ("", "another camera fits as well"))
+    nothing = np.zeros((0, 1, 1, 3), np.uint8)
+    mapping = map_joints(arm, NAMES, swing(24, 0))
+    places = [Place([0, 2], {}, nothing, sure), Place([1], {}, nothing, unsure)]
+    path = tmp_path / "c.json"
+    path.write_text(json.dumps(RobotCameras(arm, mapping, [0, 1, 2, 3], {FRONT: places}).content(source)))
+    found = [read_calibration(path, FRONT, episode, 1, WIDTH, HEIGHT) for episode in range(4)]
+    assert [camera is not None for camera in found] == [True, False, True, False]
+    whole = RobotCameras(arm, mapping, [0, 2], {FRONT: places[:1]}).content(source)
+    assert list(whole["cameras"]) == [FRONT]
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from lerobot.datasets import LeRobotDatasetMetadata
 
@@ -22,7 +23,7 @@ from lerobot_msdyn.augment.report.pictures import (
     spread,
     strip,
 )
-from lerobot_msdyn.dataset.provenance import SOURCE_VARIANT
+from lerobot_msdyn.dataset.provenance import CALIBRATION, FOLDER, SOURCE_VARIANT
 from lerobot_msdyn.dataset.read import open_source, read_colour
 from lerobot_msdyn.dataset.rows import read_rows
 from lerobot_msdyn.dataset.write import NewEpisode
@@ -31,6 +32,7 @@ logger = logging.getLogger(__name__)
 
 NAME = "report.html"
 PICTURED = 16  # views with pictures
+MOST_LINKS = 6  # pictures of a robot's links
 
 
 def write_report(
@@ -59,10 +61,16 @@ def write_report(
         entry = entries[i]
         entries[i] = replace(entry, pictures=_pictures(source, output, places[i], entry))
     path = root / NAME
-    path.write_text(
-        page(name, _figures(episodes, entries, skipped_episodes, seconds), entries, skipped), encoding="utf-8"
-    )
+    figures, links = _figures(episodes, entries, skipped_episodes, seconds), _links(root)
+    path.write_text(page(name, figures, entries, skipped, links), encoding="utf-8")
     return path
+
+
+def _links(root: Path) -> dict[str, str]:
+    """The pictures of a robot's links over the video, by name."""
+    paths = sorted((root / FOLDER / CALIBRATION).glob("*.png"))[:MOST_LINKS]
+    pictures = {path.stem: cv2.imread(str(path)) for path in paths}
+    return {name: data_url(picture[..., ::-1].copy()) for name, picture in pictures.items() if picture is not None}
 
 
 def entries_of(episodes: Sequence[NewEpisode]) -> tuple[list[ViewEntry], dict[int, int]]:

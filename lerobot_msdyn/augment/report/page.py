@@ -1,7 +1,7 @@
 """The page itself: one HTML file with everything in it; every text from outside is escaped."""
 
 import html
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -97,7 +97,13 @@ class ViewEntry:
         return float(self.view.get("scores", {}).get("expected_db", float("inf")))
 
 
-def page(title: str, figures: dict[str, str], entries: Sequence[ViewEntry], skipped: Sequence[str]) -> str:
+def page(
+    title: str,
+    figures: dict[str, str],
+    entries: Sequence[ViewEntry],
+    skipped: Sequence[str],
+    links: Mapping[str, str] | None = None,
+) -> str:
     """The whole report.
 
     Args:
@@ -105,6 +111,7 @@ def page(title: str, figures: dict[str, str], entries: Sequence[ViewEntry], skip
         figures: what to say at the top, by name.
         entries: all views; those with pictures are shown at length.
         skipped: why source episodes were left out, one line per reason.
+        links: pictures of the robot's links over the video, by name.
     """
     shown = [entry for entry in entries if entry.pictures is not None or entry.dropped]
     top = "".join(f"<div><b>{text(value)}</b>{text(name)}</div>" for name, value in figures.items())
@@ -127,7 +134,7 @@ def page(title: str, figures: dict[str, str], entries: Sequence[ViewEntry], skip
         f"<title>{text(title)}</title><style>{STYLE}</style></head><body><main>"
         f'<h1>{text(title)}</h1><p class="soft">Left and above: recorded. Right and below: rendered from the new '
         "camera. Scores are estimates: no true picture of the new views exists.</p>"
-        f'<div class="figures">{top}</div>{left_out}<h2>What moves</h2>{moves}{_cameras(entries)}'
+        f'<div class="figures">{top}</div>{left_out}<h2>What moves</h2>{moves}{_cameras(entries)}{_links(links or {})}'
         f"<h2>Views</h2>{''.join(_article(entry) for entry in shown[:LISTED])}"
         f'<h2>All views</h2><div class="scroll">{_table(entries[:LISTED])}</div>{rest}'
         "</main></body></html>\n"
@@ -168,6 +175,13 @@ def _cameras(entries: Sequence[ViewEntry]) -> str:
     more = [f"{len(lines) - LISTED} more are in meta/msdyn/episodes.parquet"] if len(lines) > LISTED else []
     what = bullets(lines[:LISTED] + more) if lines else "<p>They keep still.</p>"
     return f"<h2>Recorded cameras (px of 320)</h2>{what}"
+
+
+def _links(pictures: Mapping[str, str]) -> str:
+    if not pictures:
+        return ""
+    shown = "".join(f'<p>{text(name)}</p><img src="{url}" alt="{text(name)}">' for name, url in pictures.items())
+    return f"<h2>The robot's links by its joints</h2>{shown}"
 
 
 def text(value: object) -> str:

@@ -10,7 +10,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.core.sampling import REFERENCE_WIDTH, evenly
-from lerobot_msdyn.priors.camera.path import CameraPath, camera_path, cells, cells_won, distances_px, evened
+from lerobot_msdyn.priors.camera.path import CameraPath, cells, cells_won, distances_px, evened
 
 DRIFT_PX = 1.5  # of 320: a picture that goes further within a stand is brought back
 STEP_PX = 2.5  # of 320: a sudden move beyond which the camera stands elsewhere
@@ -71,11 +71,6 @@ class Stands:
             for stand, step_px in zip(self.stands[1:], self.steps_px, strict=True)
         ]
         return {"drift_px": round(self.drift_px, 1), "moved": moved, "stands": not self.moves}
-
-
-def camera_stands(rgb: UInt8[Tensor, "t h w 3"]) -> Stands:
-    """Where the camera of a clip stood, by the path of its background."""
-    return stands_along(camera_path(rgb), rgb)
 
 
 def stands_along(path: CameraPath, rgb: UInt8[Tensor, "t h w 3"]) -> Stands:
