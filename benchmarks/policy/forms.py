@@ -42,14 +42,13 @@ class Form:
 FORMS = {
     "full": Form(),
     "reduced": Form(
-        episodes=24,
         mesh_cell_m=0.004,
         shadows=0,
         samples=0,
-        product=("--fit.steps=100",),
+        product=("--fit.steps=100", "--fit.max_width=160", "--scene.moving_gaussians=12000", "--scene.moving_frames=12"),
         cameras=FEW,
-        steps=4000,
-        input_width=64,
+        steps=8000,
+        input_width=96,
         act_steps=2000,
     ),
     "tiny": Form(

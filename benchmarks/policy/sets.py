@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
 RECORDED = "recorded"
+WITHOUT_JOINTS = "--camera.by_robot=false"
 Episode = tuple["Demonstration", Iterable[np.ndarray]]  # and the front pictures [h, w, 3] of its frames
 
 
@@ -160,7 +161,7 @@ def front_pictures(dataset: "LeRobotDataset", episode: int) -> list[np.ndarray]:
     return list(decoded.permute(0, 2, 3, 1).numpy())
 
 
-def product(sets: Sets, path: Path, flags: tuple[str, ...] = ()) -> None:
+def product(sets: Sets, path: Path, flags: tuple[str, ...] = (WITHOUT_JOINTS,)) -> None:
     """What the package's command makes of the recording, with its defaults but for the given flags."""
     source = sets.folder(ROWS[RECORDED])
     given = [f"--root={source}", f"--new_root={path}", "--new_repo_id=local/policy_msdyn", "--repo=local/policy"]
@@ -208,6 +209,7 @@ ROWS: dict[str, Row] = {
     "oracle": Row("oracle", oracle),
     "homography": Row("homography", homography),
     "product": Row("product", product),
+    "product with joints": Row("product_joints", partial(product, flags=("--robot.name=so101",))),
     "oracle at the product's poses": Row("oracle_product", partial(oracle_at_poses_of, "product")),
 }
 
@@ -215,17 +217,17 @@ ROWS: dict[str, Row] = {
 def _swept(name: str, field: str, values: Iterable[Any]) -> dict[str, Row]:
     """Rows of the product with one flag changed."""
     return {
-        f"{name} {value}": Row(f"product_{name}_{value}", partial(product, flags=(f"--{field}={value}",)))
+        f"{name} {value}": Row(f"product_{name}_{value}", partial(product, flags=(WITHOUT_JOINTS, f"--{field}={value}")))
         for value in values
     }
 
 
-_many = partial(product, flags=("--variants=10",))  # the first n of more variants are those of n
+_many = partial(product, flags=(WITHOUT_JOINTS, "--variants=10"))  # the first n of more variants are those of n
 SWEEPS: dict[str, dict[str, Row]] = {
     "range": _swept("range", "perturbation.azimuth_deg", (5, 10, 15, 20, 30)),
     "sampling": {
         "one pose per episode": ROWS["product"],
-        "one pose per frame": Row("product_per_frame", partial(product, flags=("--perturbation.per_frame=true",))),
+        "one pose per frame": Row("product_per_frame", partial(product, flags=(WITHOUT_JOINTS, "--perturbation.per_frame=true"))),
         "without the recorded episodes": Row("product", product, source=False),
     },
     "variants": {f"variants {n}": Row("product_variants_10", _many, variants=n) for n in (1, 2, 3, 6, 10)},

@@ -17,7 +17,7 @@ from .forms import Form
 from .sets import Row, front_pictures, opened
 
 RATE = 1e-3
-SAMPLES_PER_TRANSFORM = 4  # which share a sample of LeRobot's image transforms
+SAMPLES_PER_TRANSFORM = 8  # which share a sample of LeRobot's image transforms
 
 
 @dataclass(frozen=True)
