@@ -146,7 +146,6 @@ def augment(
     from lerobot_msdyn.augment.failures import one_line_each
     from lerobot_msdyn.augment.report.build import entries_of, write_report
     from lerobot_msdyn.augment.report.page import accounts_of
-    from lerobot_msdyn.augment.robot_cameras import calibrated
     from lerobot_msdyn.augment.run import run_local
     from lerobot_msdyn.augment.run_identity import recipe_text
     from lerobot_msdyn.dataset.provenance import CALIBRATION, FOLDER, SOURCE_VARIANT
@@ -160,9 +159,7 @@ def augment(
     check_disk(source, episodes, config, staging.folder)
     with OutputDataset(source, new_repo_id, new_root, staging, nvenc=config.nvenc) as output:
         output.check(cameras, depth=config.render_depth)
-        found = staging.folder / CALIBRATION
-        used = calibrated(source, episodes, cameras, config, found)
-        made, failures = run_local(source, episodes, cameras, used, output)
+        made, failures = run_local(source, episodes, cameras, config, output)
         new = [episode for episode in made if not episode.dropped]
         skipped = one_line_each(source.repo_id, failures) + _lost(config, source)
         dropped = [f"episode {e.source_index} variant {e.provenance.variant}: {e.dropped}" for e in made if e.dropped]
@@ -174,8 +171,8 @@ def augment(
             raise EpisodeError(f"no episode could be augmented; nothing was written. First: {first}")
 
         def report(folder: Path) -> Path:
-            if found.is_dir():
-                shutil.copytree(found, folder / FOLDER / CALIBRATION)
+            if (staging.folder / CALIBRATION).is_dir():
+                shutil.copytree(staging.folder / CALIBRATION, folder / FOLDER / CALIBRATION)
             seconds = time.perf_counter() - start
             return write_report(source, folder, new_root.name, made, skipped, len(failures), seconds)
 

@@ -25,8 +25,8 @@ from lerobot_msdyn.core.sampling import REFERENCE_WIDTH, evenly
 from lerobot_msdyn.dataset.checks import picture_size
 from lerobot_msdyn.dataset.read import read_colour
 from lerobot_msdyn.dataset.rows import read_rows
+from lerobot_msdyn.priors.camera.stands import is_displaced
 from lerobot_msdyn.priors.masks.robot import RobotPictures
-from lerobot_msdyn.reconstruction.pooled_background import from_one_place
 from lerobot_msdyn.robots import JointMap, Robot, find_description, load_robot, map_joints
 from lerobot_msdyn.robots.calibration.frames import spread_frames, surface
 from lerobot_msdyn.robots.calibration.picture import links_over
@@ -232,10 +232,10 @@ def places_of(source: LeRobotDatasetMetadata, key: str, episodes: Sequence[int])
         except EpisodeError as error:
             logger.info("%s", error)
             continue
-        if others and not from_one_place(first, others[-1]):
+        if others and is_displaced(first, others[-1]):
             continue
         for picture, group in places:
-            if from_one_place(picture, first):
+            if not is_displaced(picture, first):
                 group.append(index)
                 break
         else:

@@ -21,11 +21,14 @@ from lerobot_msdyn.augment.cost import (
 )
 from lerobot_msdyn.augment.episode import augment_episode
 from lerobot_msdyn.augment.failures import same_reason
+from lerobot_msdyn.augment.robot_cameras import calibrated
 from lerobot_msdyn.augment.run_identity import source_folder
 from lerobot_msdyn.augment.workers import Work, Workers, threads_of_one, workers_for
 from lerobot_msdyn.core.errors import EpisodeError, MsdynError
 from lerobot_msdyn.dataset.convert import named_as_given
+from lerobot_msdyn.dataset.provenance import CALIBRATION
 from lerobot_msdyn.dataset.read import depth_key_of
+from lerobot_msdyn.dataset.rows import files_problem
 from lerobot_msdyn.dataset.write import NewEpisode, OutputDataset
 from lerobot_msdyn.render.devices import chosen_device
 
@@ -43,6 +46,10 @@ def run_local(
 ) -> tuple[list[NewEpisode], dict[int, str]]:
     """All episodes on this machine, and why some failed: they are left out, and every reason is logged once."""
     chosen_device(config.device)  # complains, or says what is used, before anything is done
+    problems = {index: files_problem(source, index) for index in episodes}  # known before minutes of work
+    whole = [index for index in episodes if not problems[index]]
+    if whole:
+        config = calibrated(source, whole, cameras, config, output.staging.folder / CALIBRATION)
     _say_what_is_assumed(source, cameras, config)
     new: list[NewEpisode] = []
     failures: dict[int, str] = {}
@@ -59,8 +66,9 @@ def run_local(
 
         bar.set_description_str("looking at the background", refresh=watched)
         work = Work(source, cameras, config, output, progress)
-        with contextlib.closing(_attempts(work, episodes)) as attempts:  # workers end before the lock is let go
-            for index, failure in zip(episodes, attempts, strict=True):
+        with contextlib.closing(_attempts(work, whole)) as attempts:  # workers end before the lock is let go
+            for index in episodes:
+                failure = problems[index] or next(attempts)
                 if failure is None:
                     new += output.finish_episode(index, _make(work, index))
                     continue

@@ -77,6 +77,20 @@ class PointTracks:
 
 
 @dataclass(frozen=True)
+class BodyTracks:
+    """Points of rigid bodies whose motion is known, such as a robot's links."""
+
+    xyz: Float[Tensor, "n t 3"]  # m, in the world, also where they are hidden
+    visible: Bool[Tensor, "n t"]
+    body: Int[Tensor, " n"]  # 0, 1, ...
+    instance: int = 0  # instance id of all of them; 0: not told yet
+
+    def select(self, frames: slice | Int[Tensor, " s"]) -> "BodyTracks":
+        """The same at some of their frames."""
+        return replace(self, xyz=self.xyz[:, frames], visible=self.visible[:, frames])
+
+
+@dataclass(frozen=True)
 class Priors:
     """Everything known about a video before any Gaussian is fitted."""
 
@@ -86,6 +100,7 @@ class Priors:
     depth_traits: DepthTraits = DepthTraits()
     provenance: dict[str, dict[str, str]] = field(default_factory=dict)  # prior -> provider, why, model, licence
     camera: CameraTrack | None = None  # the one to use from here on; None: that of the video
+    bodies: BodyTracks | None = None  # in place of the tracks of their instance
 
     @property
     def metric(self) -> bool:
@@ -99,12 +114,14 @@ class RobotSeen:
 
     depth: Float[Tensor, "t h w"]  # m, z-depth of the robot; 0 = none is there
     moving: Bool[Tensor, "t h w"]  # pixels of links that move during the episode
+    bodies: BodyTracks  # those links
     ground_m: float  # height of what the robot stands on, in the world
     model: Model = Model()  # its description
 
     def select(self, frames: slice | Int[Tensor, " s"]) -> "RobotSeen":
         """The same at some of its frames."""
-        return replace(self, depth=self.depth[frames], moving=self.moving[frames])
+        bodies = self.bodies.select(frames)
+        return replace(self, depth=self.depth[frames], moving=self.moving[frames], bodies=bodies)
 
     def resized(self, width: int, height: int) -> "RobotSeen":
         """The same with another number of pixels (the nearest ones)."""

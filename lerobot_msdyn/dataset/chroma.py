@@ -4,15 +4,15 @@ Joint bilateral upsampling (Kopf et al., "Joint Bilateral Upsampling", 2007): th
 the four recorded samples around it, weighted by distance and by how alike the luma is.
 """
 
-import inspect
 import math
 
 import numpy as np
 import torch
 from jaxtyping import Float32, UInt8
-from numba import njit
 from numpy import ndarray
 from torch import Tensor
+
+from lerobot_msdyn.core.compiled import compiled
 
 RED, GREEN, BLUE = 0.299, 0.587, 0.114  # luma of ITU-R BT.601, as decoders use it at these sizes
 LUMA_SIGMA = 20.0  # difference of luma (0..255) at which a sample counts exp(-1/2)
@@ -72,4 +72,4 @@ def _restored(
             out[row, column, 2] = min(255, max(0, round(luma[row, column] + blue)))
 
 
-_restore = njit(cache=True, nogil=True)(inspect.unwrap(_restored))  # unwrapped of the tests' type checker
+_restore = compiled(_restored)

@@ -117,6 +117,19 @@ def source_file(meta: LeRobotDatasetMetadata, index: int, relative: Path) -> Pat
         raise EpisodeError(f"{meta.repo_id} episode {index}: {error}") from error
 
 
+def files_problem(meta: LeRobotDatasetMetadata, index: int) -> str:
+    """Why the files of an episode cannot be read, as far as that is seen without opening them; empty if they can."""
+    try:
+        problem = place_problem(meta.episodes[index], meta.video_keys)
+        if problem is not None:
+            return f"{meta.repo_id} episode {index}: meta/episodes says that {problem}"
+        for path in [*data_files(meta, index), *(meta.get_video_file_path(index, key) for key in meta.video_keys)]:
+            source_file(meta, index, path)
+    except EpisodeError as error:
+        return str(error)
+    return ""
+
+
 def task_of(meta: LeRobotDatasetMetadata, rows: pa.Table) -> str:
     """What the robot was told to do in the first row."""
     tasks = meta.tasks

@@ -13,7 +13,7 @@ from lerobot_msdyn.core.config import MotionConfig
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.core.fields import problems
 from lerobot_msdyn.core.geometry import transform_points
-from lerobot_msdyn.core.observations import PointTracks
+from lerobot_msdyn.core.observations import BodyTracks, PointTracks
 from lerobot_msdyn.core.sampling import scaled_px
 from lerobot_msdyn.motion.finer.add_level import Approve, add_level
 from lerobot_msdyn.motion.finer.residual import ResidualTracks, pull_back
@@ -44,8 +44,9 @@ def scene_motion(
     camera: CameraTrack,
     config: MotionConfig,
     recording: Recording | None = None,
+    bodies: BodyTracks | None = None,
 ) -> SceneMotion | None:
-    """Motion of everything that was tracked, or None where nothing was.
+    """Motion of everything that was tracked or is known, or None where nothing is.
 
     Args:
         tracks: points followed in the image.
@@ -53,16 +54,18 @@ def scene_motion(
         camera: the camera that saw both.
         config: the levels.
         recording: what the video shows, by which the object level is improved and finer ones are judged.
+        bodies: those whose motion is known; it is their object level.
     """
     xyz, valid = lift_tracks(tracks, depth, camera)
     kept = _longest(valid, tracks.instance)
-    if len(kept) == 0:
+    lifted = LiftedTracks(xyz[kept], valid[kept], tracks.confidence[kept], tracks.instance[kept], 0.0)
+    if bodies is not None:
+        lifted = lifted.followed_by(bodies)
+    if not bool(lifted.valid.any()):
         return None
-    xyz, valid = xyz[kept], valid[kept]
-    in_camera = transform_points(camera.camera_from_world, xyz.transpose(0, 1))[..., 2].T[valid]
+    in_camera = transform_points(camera.camera_from_world, lifted.xyz.transpose(0, 1))[..., 2].T[lifted.valid]
     pixel_m = scaled_px(float(in_camera.median() / camera.intrinsics[0, 0, 0]), camera.width)
-    lifted = LiftedTracks(xyz, valid, tracks.confidence[kept], tracks.instance[kept], pixel_m)
-    return motion_from_tracks(lifted, config, recording)
+    return motion_from_tracks(replace(lifted, pixel_m=pixel_m), config, recording)
 
 
 def motion_from_tracks(tracks: LiftedTracks, config: MotionConfig, recording: Recording | None = None) -> SceneMotion:
@@ -78,7 +81,7 @@ def motion_from_tracks(tracks: LiftedTracks, config: MotionConfig, recording: Re
     parts = rigid_parts(tracks, config)
     registered = parts
     if recording is not None and first.by_video and bool(_bases(parts).active.any()):
-        registered = recording.register(parts, config)
+        registered = recording.register(parts, config, _known_instance(tracks))
     if registered is parts:
         recording = None  # finer levels are judged by tracks alone
     given = PartTracks(
@@ -132,19 +135,35 @@ def _with_finer_levels(
 def rigid_parts(tracks: LiftedTracks, config: MotionConfig) -> SceneMotion:
     """The rigid parts of all instances, and their motions, by tracks alone: an object level."""
     canonical = canonical_frame(tracks.valid, tracks.instance)
-    part = split_rigid_parts(
-        tracks.xyz, tracks.valid, tracks.confidence, tracks.instance, config.max_parts, tracks.pixel_m
+    known = torch.zeros_like(tracks.instance, dtype=torch.bool) if tracks.body is None else tracks.body >= 0
+    rows = (~known).nonzero()[:, 0]
+    part = torch.full_like(tracks.instance, -1)
+    part[rows] = split_rigid_parts(
+        tracks.xyz[rows],
+        tracks.valid[rows],
+        tracks.confidence[rows],
+        tracks.instance[rows],
+        config.max_parts,
+        tracks.pixel_m,
     )
+    if tracks.body is not None:
+        part[known] = tracks.body[known] + int(part.max()) + 1
     objects, points = initialise_objects(
         tracks.xyz,
-        tracks.valid,
-        tracks.confidence,
+        tracks.valid | known[:, None],
+        torch.where(known[:, None], 1.0, tracks.confidence),
         part,
         canonical,
         still_m=_STILL_PX * tracks.pixel_m,
         frames_per_knot=frames_per_knot("object", config),
     )
     return SceneMotion(("object",), (objects,), canonical, points, part, tracks.instance)
+
+
+def _known_instance(tracks: LiftedTracks) -> int:
+    """The instance whose bodies are known; 0: there is none."""
+    known = tracks.instance[:0] if tracks.body is None else tracks.instance[tracks.body >= 0]
+    return int(known[0]) if len(known) else 0
 
 
 def _bases(parts: SceneMotion) -> MotionLevel:

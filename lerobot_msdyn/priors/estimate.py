@@ -54,8 +54,9 @@ def estimate_priors(
     pinhole, camera_from = provide(
         CameraProvider, camera.poses, request, lambda provider: provider.estimate(request, instances), file=CameraFile
     )
+    robot = 0
     if view.robot is not None:
-        instances = with_robot(instances, view.robot.moving)
+        instances, robot = with_robot(instances, view.robot)
     posed = replace(request, view=replace(view, camera=pinhole))
     depth, depth_from = provide(
         DepthProvider, config.depth, posed, lambda provider: provider.estimate(posed, instances), file=DepthFile
@@ -64,7 +65,7 @@ def estimate_priors(
         TrackProvider, config.tracks, posed, lambda provider: provider.estimate(posed, instances), file=TrackFile
     )
     if view.robot is not None:
-        depth = with_robot_depth(depth, view.robot.depth)
+        depth = with_robot_depth(depth, instances, view.robot, robot)
     if camera.fov_search:
         pinhole, camera_from = with_searched_fov(pinhole, tracks, depth)
     origins = {"camera": camera_from, "masks": masks_from, "depth": depth_from, "tracks": tracks_from}
@@ -74,7 +75,8 @@ def estimate_priors(
     for prior, origin in origins.items():
         logger.info("%s: %s%s", prior, origin.line, counts.get(prior, ""))
     provenance = {prior: origin.entry() for prior, origin in origins.items()}
-    return Priors(depth.z, instances, tracks, depth.traits, provenance, pinhole)
+    bodies = replace(view.robot.bodies, instance=robot) if view.robot is not None and robot else None
+    return Priors(depth.z, instances, tracks, depth.traits, provenance, pinhole, bodies)
 
 
 def estimate_masks(
@@ -87,9 +89,10 @@ def estimate_masks(
     key: str | None = None,
     device: Device = "auto",
 ) -> UInt8[Tensor, "t h w"]:
-    """The masks of `estimate_priors` alone (0 = nothing moves), which finds them in the cache afterwards."""
+    """The masks of `estimate_priors` alone (0 = nothing moves), which finds the provider's in the cache afterwards."""
     cache, networks_on = open_cache(config.cache, view.rgb), chosen_device(device, networks=True).type
-    return _masks(Request(view, config, camera, cache, (), elsewhere, episode, key, networks_on))[0]
+    instances = _masks(Request(view, config, camera, cache, (), elsewhere, episode, key, networks_on))[0]
+    return instances if view.robot is None else with_robot(instances, view.robot)[0]
 
 
 def _masks(request: Request) -> tuple[Masks, Origin]:

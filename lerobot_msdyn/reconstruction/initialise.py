@@ -31,6 +31,8 @@ MASK_BORDER_PX = 2  # of 320: so far from a mask its border cannot be trusted
 FRONT_MARGIN = 0.01  # a point nearer than this share of the recorded depth is in front of it
 MAX_CONTRADICTIONS = 0.3  # share of frames in which a point may be missing where it should have been seen
 VOXEL_GROWTH = 1.15  # of the voxels' side, until there are few enough
+ROUGH_BORDER_PX = 2  # of 320; with depth that is not sharp: from the border of a mask ...
+ROUGH_FRAMES = 6  # ... and so few frames are gathered, whose depths disagree; known bodies aside
 EDGE_JUMP = 0.03  # relative difference of neighbouring depths beyond which a pixel may lie between two surfaces
 
 
@@ -63,7 +65,7 @@ def _motion(view: View, priors: Priors, config: MotionConfig) -> SceneMotion | N
     """Motion of everything that was tracked, by what was recorded too where depth is true."""
     wanted = config.register and priors.metric
     recording = Recording.of(view.rgb, priors.depth, priors.instances, view.camera) if wanted else None
-    return scene_motion(priors.tracks, priors.depth, view.camera, config, recording)
+    return scene_motion(priors.tracks, priors.depth, view.camera, config, recording, priors.bodies)
 
 
 def gather_moving(
@@ -75,9 +77,20 @@ def gather_moving(
     pixel's size, so that what one frame hides is taken from another. Larger voxels are used where these are too many.
     """
     frames = evenly(len(view), config.moving_frames).tolist()
+    sharp = priors.depth_traits.sharp
+    few = frames if sharp else evenly(len(view), min(config.moving_frames, ROUGH_FRAMES)).tolist()
+    border_px = config.mask_border_px if sharp else max(config.mask_border_px, ROUGH_BORDER_PX)
+    known = 0 if priors.bodies is None else priors.bodies.instance
     gathered, parts = [], []
-    for frame in frames:
-        inside = _certain(priors.instances[frame] > 0, priors.depth[frame], config.mask_border_px).reshape(-1)
+    for frame in sorted({*frames, *few}):
+        depth, instances = priors.depth[frame], priors.instances[frame]
+        body = (instances == known) & (instances > 0)
+        chosen = torch.zeros_like(body)
+        if frame in few:
+            chosen |= _certain(instances > 0, depth, border_px) & ~body
+        if frame in frames:
+            chosen |= _certain(instances > 0, depth, config.mask_border_px) & body
+        inside = chosen.reshape(-1)
         if not bool(inside.any()):
             continue
         pixels, _ = pixel_gaussians(view.rgb[frame], fill_depth(priors.depth[frame]), view.camera, frame)
@@ -98,7 +111,7 @@ def gather_moving(
         growth *= VOXEL_GROWTH
         merged = merge_voxels(points, part, growth * voxel)
     moving, part = merged
-    kept = ~contradicted(moving.means, part, motion, view, priors, frames)
+    kept = ~contradicted(moving.means, part, motion, view, priors, few)
     moving, part = moving.select(kept), part[kept]
     most = slice(config.moving_gaussians)  # one voxel per part may still be too many
     moving, part = moving.select(most), part[most]

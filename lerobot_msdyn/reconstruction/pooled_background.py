@@ -14,10 +14,9 @@ from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.observations import View
-from lerobot_msdyn.core.sampling import REFERENCE_WIDTH, evenly, scaled_px, scaled_window
+from lerobot_msdyn.core.sampling import evenly, scaled_px, scaled_window
 from lerobot_msdyn.core.serialise import from_named_tensors, named_tensors
-from lerobot_msdyn.priors.camera.path import displacement_px
-from lerobot_msdyn.priors.camera.stands import DRIFT_PX, LEAST_PX
+from lerobot_msdyn.priors.camera.stands import is_displaced
 from lerobot_msdyn.priors.depth.flying_pixels import clean_recorded_depth
 from lerobot_msdyn.priors.masks.moving import temporal_median
 from lerobot_msdyn.reconstruction.background import MARGIN_PX, SAMPLES, EmptyScene, empty_scene
@@ -183,8 +182,7 @@ def from_one_place(picture: UInt8[Tensor, "h w 3"], other: UInt8[Tensor, "i j 3"
     """
     if shift_px(picture.numpy(), other.numpy()) >= scaled_px(MAX_SHIFT_PX, picture.shape[1]):
         return False
-    displaced = displacement_px(picture, other)
-    return displaced is None or displaced < max(DRIFT_PX, LEAST_PX * REFERENCE_WIDTH / picture.shape[1])
+    return not is_displaced(picture, other)
 
 
 def shift_px(picture: UInt8[ndarray, "h w 3"], other: UInt8[ndarray, "i j 3"]) -> float:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import concatenated
-from lerobot_msdyn.core.config import Recipe, SceneConfig
+from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.observations import Priors, View
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.dataset.provenance import merged
@@ -40,8 +40,6 @@ from lerobot_msdyn.scene.dynamic import DynamicScene
 
 logger = logging.getLogger(__name__)
 
-ROUGH_BORDER_PX = 2  # of 320; with depth that is not sharp: from the border of a mask ...
-ROUGH_FRAMES = 6  # ... and so few frames are gathered, whose depths disagree
 FURTHER_STEPS = 0.6  # share of the fit's steps that suffices where the static set has been fitted already
 
 
@@ -113,10 +111,7 @@ def _background(draft: Draft) -> None:
 
 def _initial_scene(draft: Draft) -> None:
     """Static and moving Gaussians, and the motion of the latter."""
-    settings = draft.recipe.scene
-    if not draft.priors.depth_traits.sharp:
-        settings = _for_rough_depth(settings)
-    scene = initialise(draft.view, draft.priors, settings, draft.recipe.motion, draft.empty)
+    scene = initialise(draft.view, draft.priors, draft.recipe.scene, draft.recipe.motion, draft.empty)
     if draft.shared is not None and draft.shared.static is not None:
         scene = replace(scene, static=adapted(draft.shared, draft.empty, scene.static))
     draft.scene = replace(scene, near=NEAR * draft.distance)
@@ -283,12 +278,3 @@ def _shared_by_windows(
 
     with torch_on_one_thread():
         return share_backgrounds([part.few_frames(recipe.fit.max_width) for part in parts], moving, recipe)
-
-
-def _for_rough_depth(scene: SceneConfig) -> SceneConfig:
-    """Settings for depth that is uncertain near edges, and disagrees between frames."""
-    return replace(
-        scene,
-        mask_border_px=max(scene.mask_border_px, ROUGH_BORDER_PX),
-        moving_frames=min(scene.moving_frames, ROUGH_FRAMES),
-    )

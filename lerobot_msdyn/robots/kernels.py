@@ -1,19 +1,13 @@
 """Compiled loops: depth of triangles, coverage of points."""
 
-import inspect
-from collections.abc import Callable
-
-import numba
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 from numpy import ndarray
 
-
-def _kernel(function: Callable) -> Callable:
-    return numba.njit(cache=True, nogil=True)(inspect.unwrap(function))  # unwrap: of the tests' type checker
+from lerobot_msdyn.core.compiled import compiled
 
 
-@_kernel
+@compiled
 def draw_triangles(
     points: Float64[ndarray, "v 3"],
     faces: Int32[ndarray, "f 3"],
@@ -57,7 +51,7 @@ def draw_triangles(
                     index[y, x] = face
 
 
-@_kernel
+@compiled
 def place_vertices(
     vertices: Float32[ndarray, "v 3"],
     link: Int32[ndarray, " v"],
@@ -71,7 +65,7 @@ def place_vertices(
             out[v, k] = pose[k, 0] * x + pose[k, 1] * y + pose[k, 2] * z + pose[k, 3]
 
 
-@_kernel
+@compiled
 def trace_edges(
     index: Int32[ndarray, "h w"],
     depth: Float32[ndarray, "h w"],
@@ -101,7 +95,7 @@ def trace_edges(
     return count
 
 
-@_kernel
+@compiled
 def cover(
     points: Float32[ndarray, "t n 3"],
     rotation: Float64[ndarray, "3 3"],
@@ -136,7 +130,7 @@ def cover(
                         out[i, j, t] = min(np.float32(1.0), out[i, j, t] + np.float32(weight * share))
 
 
-@_kernel
+@compiled
 def agreement(centred: Float32[ndarray, "h w t"], covered: Float32[ndarray, "h w t"]) -> tuple[float, float]:
     """Sum of products of masks, less their mean over time, with coverage; and the coverage's squares about its mean."""
     height, width, frames = covered.shape

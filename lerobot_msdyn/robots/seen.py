@@ -4,17 +4,21 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Float32
+from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.core.observations import Model, RobotSeen
+from lerobot_msdyn.core.observations import BodyTracks, Model, RobotSeen
+from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.robots.calibration.contours import Posed
 from lerobot_msdyn.robots.calibration.record import RobotRecord
 from lerobot_msdyn.robots.calibration.search import Pose
 from lerobot_msdyn.robots.description import Robot
 
 LEAST_MOTION = np.radians(1.5)  # of a joint that moves
+POINTS = 80  # of each link
+SAME_SURFACE = 0.01  # share of its depth by which a point of the surface may miss what is drawn
 
 
 def robot_seen(
@@ -47,4 +51,36 @@ def robot_seen(
     root = robot.vertices[np.unique(robot.faces[~robot.moved_by[robot.face_link].any(1)])]
     ground = float(root[:, 2].min()) if len(root) else 0.0
     model = Model(robot.name, licence=robot.licence)
-    return RobotSeen(torch.from_numpy(depth), torch.from_numpy(moving), ground, model)
+    bodies = _bodies(posed, moves, pose, depth)
+    return RobotSeen(torch.from_numpy(depth), torch.from_numpy(moving), bodies, ground, model)
+
+
+def _bodies(posed: Posed, moves: Bool[ndarray, " l"], pose: Pose, depth: Float32[ndarray, "t h w"]) -> BodyTracks:
+    """Points of the surface of every link that moves, in the robot's frame."""
+    robot, (height, width) = posed.robot, depth.shape[1:]
+    points, body, xyz = [], [], []
+    for link in np.flatnonzero(moves):
+        own = np.flatnonzero(robot.point_link == link)
+        own = own[evenly(len(own), POINTS).numpy()]
+        if len(own):
+            points.append(own)
+            body += [len(points) - 1] * len(own)
+            turned = robot.points[own] @ posed.links[:, link, :3, :3].transpose(0, 2, 1)
+            xyz.append(turned + posed.links[:, link, None, :3, 3])
+    if not xyz:
+        return BodyTracks(torch.zeros(0, len(posed), 3), torch.zeros(0, len(posed)) > 0, torch.zeros(0).long())
+    world = np.concatenate(xyz, axis=1)
+    in_camera = world @ pose.rotation.T + pose.translation
+    z = in_camera[..., 2].clip(min=1e-6)
+    column, row = (
+        np.floor(in_camera[..., axis] / z * pose.focal * width + size / 2).astype(int)
+        for axis, size in ((0, width), (1, height))
+    )
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (in_camera[..., 2] > 0)
+    seen = depth[np.arange(len(depth))[:, None], row.clip(0, height - 1), column.clip(0, width - 1)]
+    visible = inside & (seen > 0) & (np.abs(seen - z) < SAME_SURFACE * z)
+    return BodyTracks(
+        torch.from_numpy(world.transpose(1, 0, 2).astype(np.float32)),
+        torch.from_numpy(visible.T.copy()),
+        torch.tensor(body),
+    )

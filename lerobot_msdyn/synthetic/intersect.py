@@ -4,31 +4,15 @@ A ray is origin + t * direction; directions need not be unit vectors. Every `_hi
 t > EPSILON at which the ray meets the surface, or infinity.
 """
 
-import inspect
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from lerobot_msdyn.core.compiled import compiled, inlined
 
 BOX, CYLINDER, ELLIPSOID, SHEET = 0, 1, 2, 3
 EPSILON = 1e-9
 INFINITY = np.inf
-
-
-def compiled(function: Callable) -> Any:
-    """Compiles a function with numba; machine code is kept on disk.
-
-    numba notices changes of the function's own file only: after editing what it inlines, touch that file.
-    """
-    # tests wrap annotated functions in run-time checks, which cannot be compiled
-    return njit(cache=True, nogil=True, error_model="numpy")(inspect.unwrap(function))
-
-
-def inlined(function: Callable) -> Any:
-    """As `compiled`, for small functions: a real call would copy all array descriptors of a Geometry."""
-    return njit(nogil=True, error_model="numpy", forceinline=True)(inspect.unwrap(function))
-
 
 Vector = tuple[float, float, float]
 

@@ -184,10 +184,13 @@ def test_a_fault_in_one_episode_does_not_cost_the_others(
     assert LeRobotDataset("local/desk_msdyn", root=tmp_path / "new", video_backend="pyav").num_episodes == 2
 
 
-def test_one_absent_file_is_one_line(desk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_absent_file_is_one_line_before_anything_is_done(
+    desk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     root = tmp_path / "broken"
     shutil.copytree(desk, root)
     shutil.rmtree(root / "videos" / SIDE)
+    monkeypatch.setattr(job, "attempt", lambda *_: pytest.fail("work is done"))
     arguments = ["--repo", "local/desk", "--root", str(root), "--new_root", str(tmp_path / "new")]
     assert run(*arguments, "--cameras", "[front]", *FAST) == 2
     lines = [line for line in capsys.readouterr().err.splitlines() if "is absent" in line]

@@ -90,7 +90,7 @@ def test_judges_prefer_the_better_motion(recording: Recording, disturbed: SceneM
 def test_a_worse_motion_is_refused(
     recording: Recording, registered: SceneMotion, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def shifted(video: Video, points: Sightings, start: Grouping, max_parts: int) -> Grouping:
+    def shifted(video: Video, points: Sightings, start: Grouping, max_parts: int, known: int) -> Grouping:
         off = torch.eye(4).repeat(FRAMES, 1, 1).double()
         off[::2, 2, 3] = 0.05
         return replace(start, motions=off @ start.motions)

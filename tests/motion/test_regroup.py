@@ -39,3 +39,12 @@ def test_an_instance_has_no_more_parts_than_allowed(video: Video, points: Sighti
     found = regroup(video, points, truth, 1)
     assert len(found.motions) == len(truth.instance.unique())
     assert bool((found.instance[found.part] == points.instance).all())
+
+
+def test_known_parts_stay_as_they_are(video: Video, points: Sightings, truth: Grouping) -> None:
+    known = int(truth.instance[0])
+    off = truth.motions.clone()
+    off[truth.instance == known, 3, 0, 3] += 0.02
+    found = regroup(video, points, replace(truth, motions=off, tracked=off), 1, known)
+    kept = found.instance == known
+    assert torch.equal(found.motions[kept], off[truth.instance == known])

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.geometry import nearest_pixel, transform_points, unproject
-from lerobot_msdyn.core.observations import PointTracks
+from lerobot_msdyn.core.observations import BodyTracks, PointTracks
 from lerobot_msdyn.core.sampling import scaled_px
 
 _EDGE_JUMP = 0.05  # relative difference of neighbouring depths that makes an edge
@@ -29,6 +29,20 @@ class LiftedTracks:
     confidence: Float[Tensor, "n t"]  # 0..1
     instance: Int[Tensor, " n"]
     pixel_m: float  # size of a pixel of a picture 320 wide, where they are
+    body: Int[Tensor, " n"] | None = None  # rigid body of each whose motion is known, in all frames; else -1
+
+    def followed_by(self, bodies: BodyTracks) -> "LiftedTracks":
+        """With the points of bodies in place of the tracks of their instance."""
+        kept = self.instance != bodies.instance
+        known = torch.full((len(bodies.body),), bodies.instance).to(self.instance)
+        return LiftedTracks(
+            torch.cat((self.xyz[kept], bodies.xyz)),
+            torch.cat((self.valid[kept], bodies.visible)),
+            torch.cat((self.confidence[kept], bodies.visible.to(self.confidence))),
+            torch.cat((self.instance[kept], known)),
+            self.pixel_m,
+            torch.cat((torch.full((int(kept.sum()),), -1), bodies.body)),
+        )
 
 
 def lift_tracks(

@@ -4,13 +4,12 @@
 Everything is in the axes of the camera, in m. numba looks for changes in this file only.
 """
 
-import inspect
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from lerobot_msdyn.core.compiled import compiled, inlined
 
 REACH_PX = 2  # to either side, over which normals are taken, and 1 for gradients
 OUTSIDE_UNIT = 8  # steps per px of the distance outside the masks
@@ -26,14 +25,6 @@ LEAST_CURVATURE = 1e-9  # of the normal equations, where nothing is seen or held
 UNSEEN = 0.5  # cost of a frame that tells nothing of a point, between those of agreement and of contradiction
 
 NOTHING, MET, STRAY, IN_FRONT = 0, 1, 2, 3
-
-
-def _compiled(function: Callable) -> Callable:
-    return njit(cache=True, nogil=True, error_model="numpy")(inspect.unwrap(function))
-
-
-def _inlined(function: Callable) -> Callable:
-    return njit(nogil=True, error_model="numpy", forceinline=True)(inspect.unwrap(function))
 
 
 class Maps(NamedTuple):
@@ -56,7 +47,7 @@ class Points(NamedTuple):
     first: np.ndarray  # [k+1] int64, the first point of each part
 
 
-@_inlined
+@inlined
 def _surface(maps, t, row, column):
     """Recorded point and unit normal (towards the camera) of a pixel."""
     k = maps.intrinsics[t]
@@ -86,7 +77,7 @@ def _surface(maps, t, row, column):
     return z * u, z * v, z, nx / length, ny / length, nz / length
 
 
-@_inlined
+@inlined
 def _slopes(image, t, row, column):
     """Central differences by x and y, per px."""
     height, width = image.shape[1:]
@@ -97,7 +88,7 @@ def _slopes(image, t, row, column):
     return x, y
 
 
-@_inlined
+@inlined
 def _compare(maps, t, x, y, z, nx, ny, nz, out):
     """What a frame says of a point: MET, STRAY, IN_FRONT or NOTHING.
 
@@ -134,7 +125,7 @@ def _compare(maps, t, x, y, z, nx, ny, nz, out):
     return MET
 
 
-@_compiled
+@compiled
 def frame_costs(points, normals, grey, frames, maps):
     """How badly points fit frames, 0 to 1 each: [f,n] from points and normals [f,n,3] in the camera, grey [n]."""
     costs = np.full(points.shape[:2], np.float32(UNSEEN))
@@ -160,7 +151,7 @@ def frame_costs(points, normals, grey, frames, maps):
     return costs
 
 
-@_inlined
+@inlined
 def _solve6(a, b):
     """Solve a x = b in place, a symmetric and positive definite [6,6]."""
     for i in range(6):
@@ -179,7 +170,7 @@ def _solve6(a, b):
         b[i] /= a[i, i]
 
 
-@_inlined
+@inlined
 def _add(hessian, slope, weight, residual, gradient, arm, scale):
     """One residual with its gradient by the point, in the normal equations of a turn (in m) and a shift."""
     row = (
@@ -196,7 +187,7 @@ def _add(hessian, slope, weight, residual, gradient, arm, scale):
             hessian[i, j] += weight * row[i] * row[j]
 
 
-@_inlined
+@inlined
 def _product(a, b):
     """Product of two matrices [3,3]."""
     out = np.zeros((3, 3))
@@ -206,7 +197,7 @@ def _product(a, b):
     return out
 
 
-@_inlined
+@inlined
 def _placed(a, b):
     """Product of a matrix [3,3] and a point [3]."""
     out = np.zeros(3)
@@ -215,7 +206,7 @@ def _placed(a, b):
     return out
 
 
-@_inlined
+@inlined
 def _turned(rotation, step):
     """A rotation after a turn by a rotation vector, all [3,3] and [3]."""
     angle = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
@@ -232,7 +223,7 @@ def _turned(rotation, step):
     return _product(turn, rotation)
 
 
-@_inlined
+@inlined
 def _look(points, first, last, pose, maps, t, status, terms):
     """Compare some points with a frame; returns their mean difference of grey values.
 
@@ -260,7 +251,7 @@ def _look(points, first, last, pose, maps, t, status, terms):
     return mean / max(count, 1)
 
 
-@_inlined
+@inlined
 def _add_point(hessian, slope, outcome, term, mean, pivot, unit, maps, t):
     """The residuals of one point, by the `outcome` of its comparison."""
     k = maps.intrinsics[t]
@@ -284,7 +275,7 @@ def _add_point(hessian, slope, outcome, term, mean, pivot, unit, maps, t):
     _add(hessian, slope, weight, residual, (gx, gy, -(gx * x + gy * y) / z), arm, unit)
 
 
-@_inlined
+@inlined
 def _add_hold(hessian, slope, hold, pose, held, middle, unit):
     """The pull of a pose to another one; `middle` is the part's pivot at the canonical frame."""
     turn = _product(pose, held[:3, :3].T)
@@ -298,7 +289,7 @@ def _add_hold(hessian, slope, hold, pose, held, middle, unit):
         hessian[i, i] += hold
 
 
-@_compiled
+@compiled
 def align_poses(poses, held, hold, pivots, reach, points, maps, steps, longest):
     """Gauss-Newton steps of poses (camera from canonical) [k,t,4,4], float64, in place.
 

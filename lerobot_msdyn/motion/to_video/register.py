@@ -50,15 +50,15 @@ class Recording:
         spread = evenly(len(rgb), 2 * _MODEL_FRAMES - 1).tolist()
         return cls(video, sight(video, spread[::2], _POINTS), sight(video, spread[1::2], _JUDGES))
 
-    def register(self, motion: SceneMotion, config: MotionConfig) -> SceneMotion:
+    def register(self, motion: SceneMotion, config: MotionConfig, known: int = 0) -> SceneMotion:
         """An object level with better parts and poses, followed by the points of this recording.
 
         Unless points that were gathered at other frames agree better with the whole clip by the new motion, it stays
-        as it is.
+        as it is. The parts of the instance `known` (0: none) and their motions stay.
         """
         if len(self.points) == 0:
             return motion
-        grouping = regroup(self.video, self.points, self._start(motion), config.max_parts)
+        grouping = regroup(self.video, self.points, self._start(motion), config.max_parts, known)
         new = _with_parts(motion, grouping, self.points, frames_per_knot(motion.names[0], config))
         return new if self.costs(new)[0].mean() < self.costs(motion)[0].mean() else motion
 

@@ -32,30 +32,35 @@ class Grouping:
         return Grouping(self.part, self.motions[rows], self.tracked[rows], self.instance[rows], self.active[rows])
 
 
-def regroup(video: Video, points: Sightings, start: Grouping, max_parts: int) -> Grouping:
+def regroup(video: Video, points: Sightings, start: Grouping, max_parts: int, known: int = 0) -> Grouping:
     """Parts and motions that explain the video best, in turn (docs/motion.md, "Registration").
 
     Every part is halved, both halves are aligned and all points choose anew; then parts are given up, the least useful
-    first, while that costs little or an instance has more than `max_parts`.
+    first, while that costs little or an instance has more than `max_parts`. Those of the instance `known` (0: none)
+    stay, and their motions too.
     """
     neighbours = _neighbours(points)
-    grouping = aligned(video, points, aligned(video, points, start))
+
+    def aligned_again(grouping: Grouping) -> Grouping:
+        return aligned(video, points, grouping, known)
+
+    grouping = aligned_again(aligned_again(start))
     for _ in range(_SPLITS):
-        grouping = aligned(video, points, _halved(points, grouping))
+        grouping = aligned_again(_halved(points, grouping, known))
         for _ in range(2):
-            grouping = aligned(video, points, _chosen(_costs(video, points, grouping, neighbours), grouping))
-        grouping = aligned(
-            video, points, _pruned(_costs(video, points, grouping, neighbours), points, grouping, max_parts)
-        )
+            grouping = aligned_again(_chosen(_costs(video, points, grouping, neighbours), grouping))
+        costs = _costs(video, points, grouping, neighbours)
+        grouping = aligned_again(_pruned(costs, points, grouping, max_parts, known))
     for _ in range(2):
-        grouping = aligned(video, points, _chosen(_costs(video, points, grouping, neighbours), grouping))
+        grouping = aligned_again(_chosen(_costs(video, points, grouping, neighbours), grouping))
     return _chosen(_costs(video, points, grouping, neighbours), grouping)
 
 
-def aligned(video: Video, points: Sightings, grouping: Grouping) -> Grouping:
+def aligned(video: Video, points: Sightings, grouping: Grouping, known: int = 0) -> Grouping:
     """Moving parts after some steps towards what the video shows, loosely held by their motions from tracks."""
     motions = align(video, points, grouping.part, grouping.motions, grouping.tracked)
-    return replace(grouping, motions=torch.where(grouping.active[:, None, None, None], motions, grouping.motions))
+    free = grouping.active & (grouping.instance != known)
+    return replace(grouping, motions=torch.where(free[:, None, None, None], motions, grouping.motions))
 
 
 def _neighbours(points: Sightings) -> Int[Tensor, "n j"]:
@@ -85,13 +90,13 @@ def _chosen(costs: Float[Tensor, "n k"], grouping: Grouping) -> Grouping:
     return replace(grouping, part=costs.argmin(1))
 
 
-def _halved(points: Sightings, grouping: Grouping) -> Grouping:
+def _halved(points: Sightings, grouping: Grouping, known: int) -> Grouping:
     """Every moving part cut in two across its longest side, if there are enough points."""
     at_canonical, _ = points.at_canonical(grouping.motions, grouping.part)
     part, parents = grouping.part.clone(), list(range(len(grouping.motions)))
     for k in range(len(grouping.motions)):
         rows = (grouping.part == k).nonzero()[:, 0]
-        if not grouping.active[k] or len(rows) < 2 * _LEAST_POINTS:
+        if not grouping.active[k] or len(rows) < 2 * _LEAST_POINTS or int(grouping.instance[k]) == known:
             continue
         away = at_canonical[rows] - at_canonical[rows].mean(0)
         along = away @ torch.linalg.eigh(away.T @ away).eigenvectors[:, -1]
@@ -100,7 +105,7 @@ def _halved(points: Sightings, grouping: Grouping) -> Grouping:
     return replace(grouping.select(torch.tensor(parents)), part=part)
 
 
-def _pruned(costs: Float[Tensor, "n k"], points: Sightings, grouping: Grouping, max_parts: int) -> Grouping:
+def _pruned(costs: Float[Tensor, "n k"], points: Sightings, grouping: Grouping, max_parts: int, known: int) -> Grouping:
     """Without the parts that save too little; every instance keeps one at least, and `max_parts` at most."""
     labels = int(max(points.instance.max(), grouping.instance.max())) + 1
     of_instance = torch.bincount(points.instance, minlength=labels)[grouping.instance].clamp(min=1)
@@ -112,7 +117,7 @@ def _pruned(costs: Float[Tensor, "n k"], points: Sightings, grouping: Grouping, 
         saved = torch.zeros(len(kept)).to(loss).index_add_(0, chosen, loss) / of_instance
         saved[torch.bincount(chosen, minlength=len(kept)) < _LEAST_POINTS] = 0
         siblings = torch.bincount(grouping.instance[kept], minlength=labels)[grouping.instance]
-        useless = kept & (siblings > 1) & ((saved < _WORTH) | (siblings > max_parts))
+        useless = kept & (grouping.instance != known) & (siblings > 1) & ((saved < _WORTH) | (siblings > max_parts))
         if not bool(useless.any()):
             break
         kept[torch.where(useless, saved, torch.inf).argmin()] = False

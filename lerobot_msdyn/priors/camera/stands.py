@@ -10,7 +10,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.core.sampling import REFERENCE_WIDTH, evenly
-from lerobot_msdyn.priors.camera.path import CameraPath, cells, cells_won, distances_px, evened
+from lerobot_msdyn.priors.camera.path import CameraPath, cells, cells_won, displacement_px, distances_px, evened
 
 DRIFT_PX = 1.5  # of 320: a picture that goes further within a stand is brought back
 STEP_PX = 2.5  # of 320: a sudden move beyond which the camera stands elsewhere
@@ -73,6 +73,12 @@ class Stands:
         return {"drift_px": round(self.drift_px, 1), "moved": moved, "stands": not self.moves}
 
 
+def is_displaced(picture: UInt8[Tensor, "h w 3"], other: UInt8[Tensor, "h w 3"]) -> bool:
+    """Whether a camera stood elsewhere when it took another picture; no, where their corners do not tell."""
+    displaced_px = displacement_px(picture, other)
+    return displaced_px is not None and displaced_px >= _limit_px(picture.shape[1])
+
+
 def stands_along(path: CameraPath, rgb: UInt8[Tensor, "t h w 3"]) -> Stands:
     """Where a camera stood, by its path (`camera_path`).
 
@@ -80,7 +86,7 @@ def stands_along(path: CameraPath, rgb: UInt8[Tensor, "t h w 3"]) -> Stands:
     A camera whose picture goes far within a stretch, or very far at once, moves. What the path says counts only where
     the pictures bear it out: laid over each other by it they are more alike than as they are.
     """
-    limit_px = max(DRIFT_PX, LEAST_PX * REFERENCE_WIDTH / path.width)
+    limit_px = _limit_px(path.width)
     away = np.flatnonzero(distances_px(path) > limit_px)
     if len(away) <= _FEW:
         return _one(path, limit_px)
@@ -95,6 +101,11 @@ def stands_along(path: CameraPath, rgb: UInt8[Tensor, "t h w 3"]) -> Stands:
     steps_px = tuple(_step_px(path.places(), cut) for cut in cuts)
     moves = max(stand.drift_px for stand in stands) > MOVES_PX or max(steps_px, default=0.0) > FARTHEST_STEP_PX
     return Stands(stands, steps_px, moves)
+
+
+def _limit_px(width: int) -> float:
+    """How far (px of 320) a camera may go in pictures of a width and still stand."""
+    return max(DRIFT_PX, LEAST_PX * REFERENCE_WIDTH / width)
 
 
 def _one(path: CameraPath, limit_px: float) -> Stands:

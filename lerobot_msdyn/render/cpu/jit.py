@@ -1,14 +1,16 @@
 """How the kernels of the CPU rasterizer are compiled: when first called, once per machine, kept on disk."""
 
 import hashlib
-import inspect
 import logging
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numba
 from numba.core import event
+
+from lerobot_msdyn.core.compiled import compiled, inlined
 
 if numba.config.DISABLE_JIT:
     raise ImportError("numba's compiler is switched off (NUMBA_DISABLE_JIT)")
@@ -17,21 +19,19 @@ _log = logging.getLogger(__name__)
 
 # Reassociation stays off: results must not depend on how a compiler regroups sums. NaN and Inf keep their meaning.
 _OPTIONS = {
-    "nogil": True,
     "boundscheck": False,
-    "error_model": "numpy",
     "fastmath": {"contract", "nsz", "arcp"},
 }
 
 
-def kernel(function: Callable) -> Callable:
+def kernel(function: Callable) -> Any:
     """Compile a function that Python calls; its machine code is kept in numba's disk cache."""
-    return numba.njit(cache=True, **_OPTIONS)(inspect.unwrap(function))  # unwrap: of the tests' type checker
+    return compiled(function, **_OPTIONS)
 
 
-def device(function: Callable) -> Callable:
+def device(function: Callable) -> Any:
     """Compile a function that kernels call; it is always inlined."""
-    return numba.njit(forceinline=True, **_OPTIONS)(inspect.unwrap(function))
+    return inlined(function, **_OPTIONS)
 
 
 def source_fingerprint() -> str:
