@@ -47,7 +47,7 @@ FORMS = {
         samples=0,
         product=("--fit.steps=100", "--fit.max_width=160", "--scene.moving_gaussians=12000", "--scene.moving_frames=12"),
         cameras=FEW,
-        steps=8000,
+        steps=5000,
         input_width=96,
         act_steps=2000,
     ),

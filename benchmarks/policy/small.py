@@ -16,7 +16,9 @@ from torch import Tensor, nn
 from .forms import Form
 from .sets import Row, front_pictures, opened
 
-RATE = 1e-3
+RATE = 3e-3
+LARGEST_GRADIENT = 1.0  # norm
+GROUPS = 4  # of channels that are normalised together
 SAMPLES_PER_TRANSFORM = 8  # which share a sample of LeRobot's image transforms
 
 
@@ -70,10 +72,13 @@ class Network(nn.Module):
         super().__init__()
         self.features = nn.Sequential(
             nn.Conv2d(3, 16, 5, stride=2, padding=2),
+            nn.GroupNorm(GROUPS, 16),
             nn.ReLU(),
             nn.Conv2d(16, width, 3, stride=2, padding=1),
+            nn.GroupNorm(GROUPS, width),
             nn.ReLU(),
             nn.Conv2d(width, width, 3, padding=1),
+            nn.GroupNorm(GROUPS, width),
             nn.ReLU(),
             nn.Conv2d(width, width, 1),
         )
@@ -133,6 +138,7 @@ def train(frames: Frames, row: Row, form: Form, seed: int) -> Network:
         loss = (network.normal(network(seen, state[rows])) - network.normal(goals[rows])).abs().mean()
         optimiser.zero_grad()
         loss.backward()
+        nn.utils.clip_grad_norm_(network.parameters(), LARGEST_GRADIENT)
         optimiser.step()
         schedule.step()
         if (step + 1) % 500 == 0:
