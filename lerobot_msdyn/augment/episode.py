@@ -87,7 +87,9 @@ def augment_episode(
     priors = {key: scene.provenance for key, scene in scenes.items()}
     new = []
     if recipe.include_source:
-        new.append(NewEpisode(index, Provenance(source.repo_id, index, SOURCE_VARIANT, recipe.seed, {}, priors)))
+        known = {key: scene.camera for key, scene in scenes.items() if scene.camera.origin == "calibration"}
+        poses = {key: camera_pose(camera, camera) for key, camera in known.items()}
+        new.append(NewEpisode(index, Provenance(source.repo_id, index, SOURCE_VARIANT, recipe.seed, {}, priors, poses)))
     for variant in range(recipe.variants if cameras else 0):
         progress(f"episode {index}: rendering variant {variant}", 0.0)
         make_episode = functools.partial(_rendered, source, index, variant, recipe, output, ready, noted, other)

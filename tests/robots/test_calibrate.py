@@ -145,7 +145,11 @@ def test_new_views_by_the_arm(recorded: Path, urdf: Path, tmp_path: Path) -> Non
     arguments = ("--repo=local/arm", f"--root={recorded}", f"--new_root={out}", "--episodes=[0]", "--variants=1")
     more = ("--priors.masks=change", "--priors.depth=plane", "--gate.enabled=false", "--workers=1")
     assert augment.run(*arguments, *more, f"--robot.urdf={urdf}", *augment.FAST) == 0
-    row = pq.read_table(out / TABLE).to_pylist()[-1]
+    recorded_row, row = pq.read_table(out / TABLE).to_pylist()
+    pose = np.array(json.loads(recorded_row["views"])[FRONT]["world_from_camera"])
+    np.testing.assert_allclose(pose[:3, :3].T, POSE.rotation, atol=0.02)
+    new_pose = np.array(json.loads(row["views"])[FRONT]["world_from_camera"])
+    assert 0.001 < np.linalg.norm(new_pose[:3, 3] - pose[:3, 3]) < 0.5
     assert "the table that the robot stands on" in row["priors"]
     assert "as its author gives it" in row["priors"]
     content = json.loads((out / FOLDER / CALIBRATION / NAME).read_text())
