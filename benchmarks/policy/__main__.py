@@ -4,6 +4,7 @@
     python -m benchmarks.policy --out FOLDER --form full     # 50 demonstrations, all cameras, 3 seeds
     python -m benchmarks.policy --out FOLDER --policy act    # the same sets, trained by lerobot-train
     python -m benchmarks.policy --out FOLDER --sweep range   # how the product's settings change it
+    python -m benchmarks.policy --out FOLDER --pictures      # how true the product's pictures are, without any policy
 
 An SO-101 picks up a block in MuJoCo. Demonstrations of a scripted expert are recorded by LeRobot from a front camera
 and a wrist camera; each row of the table is a training set made of them (sets.py), all with equal gradient steps.
@@ -142,6 +143,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--steps", type=int, default=0, help="gradient steps; 0: the form's")
     parser.add_argument("--seeds", type=int, default=0, help="trainings per row; 0: the form's")
     parser.add_argument("--workers", type=int, default=0, help="of augment; 0: one per core")
+    parser.add_argument("--pictures", action="store_true", help="compare the product's pictures with exact ones alone")
     parser.add_argument("--report", action="store_true", help="print the table of what is finished, and stop")
     options = parser.parse_args(arguments)
     unknown = sorted(set(options.rows) - set(ROWS))
@@ -170,8 +172,15 @@ def main(arguments: list[str]) -> None:
     from lerobot_msdyn.dataset.video import quiet_encoders
 
     quiet_encoders()
+    study = Study(options.out, form, options.policy, options.workers)
     try:
-        Study(options.out, form, options.policy, options.workers).run(rows)
+        if options.pictures:
+            from . import pictures
+
+            chosen = [row for row in rows if row.startswith("product")]
+            print(pictures.text(pictures.fidelity(study.sets, chosen)))
+            return
+        study.run(rows)
     except KeyboardInterrupt:
         sys.stderr.write(f"interrupted; what is finished is kept in {options.out}: the same command goes on\n")
         sys.exit(130)

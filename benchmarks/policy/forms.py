@@ -45,7 +45,12 @@ FORMS = {
         mesh_cell_m=0.004,
         shadows=0,
         samples=0,
-        product=("--fit.steps=100", "--fit.max_width=160", "--scene.moving_gaussians=12000", "--scene.moving_frames=12"),
+        product=(
+            "--fit.steps=100",
+            "--fit.max_width=160",
+            "--scene.moving_gaussians=12000",
+            "--scene.moving_frames=12",
+        ),
         cameras=FEW,
         steps=5000,
         input_width=96,

@@ -48,6 +48,15 @@ class Scene:
             shown.append(self.renderer.render())
         return shown
 
+    def moving(self) -> np.ndarray:
+        """Where the front camera's last picture shows the robot or the block, [h, w] bool."""
+        self.renderer.update_scene(self.data, camera="front")
+        self.renderer.enable_segmentation_rendering()
+        geom = self.renderer.render()[..., 0].copy()
+        self.renderer.disable_segmentation_rendering()
+        floor = self.model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+        return (geom >= 0) & ~floor[np.maximum(geom, 0)]
+
 
 def simplify(spec: mujoco.MjSpec, model: mujoco.MjModel, cell_m: float) -> None:
     """Merge the vertices of each mesh within cells of a grid: a picture on a CPU costs what its triangles cost."""

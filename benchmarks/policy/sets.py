@@ -217,7 +217,9 @@ ROWS: dict[str, Row] = {
 def _swept(name: str, field: str, values: Iterable[Any]) -> dict[str, Row]:
     """Rows of the product with one flag changed."""
     return {
-        f"{name} {value}": Row(f"product_{name}_{value}", partial(product, flags=(WITHOUT_JOINTS, f"--{field}={value}")))
+        f"{name} {value}": Row(
+            f"product_{name}_{value}", partial(product, flags=(WITHOUT_JOINTS, f"--{field}={value}"))
+        )
         for value in values
     }
 
@@ -227,7 +229,9 @@ SWEEPS: dict[str, dict[str, Row]] = {
     "range": _swept("range", "perturbation.azimuth_deg", (5, 10, 15, 20, 30)),
     "sampling": {
         "one pose per episode": ROWS["product"],
-        "one pose per frame": Row("product_per_frame", partial(product, flags=(WITHOUT_JOINTS, "--perturbation.per_frame=true"))),
+        "one pose per frame": Row(
+            "product_per_frame", partial(product, flags=(WITHOUT_JOINTS, "--perturbation.per_frame=true"))
+        ),
         "without the recorded episodes": Row("product", product, source=False),
     },
     "variants": {f"variants {n}": Row("product_variants_10", _many, variants=n) for n in (1, 2, 3, 6, 10)},

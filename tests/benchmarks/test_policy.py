@@ -233,9 +233,12 @@ def test_the_whole_study_in_tiny_form(tmp_path: Path) -> None:
         "oracle": 0,
         "homography": 0,
         "product": 0,
+        "product_joints": 0,
         "oracle_product": 0,
     }
     assert all((file["pictures"][0] == frames["recorded"]["pictures"][0]).mean() > 0.9 for file in frames.values())
+    shown = run("--out", str(tmp_path), "--pictures").stdout
+    assert "| product: homography at the same poses |" in shown
     cells[0].unlink()
     before = {path: path.stat().st_mtime_ns for path in cells[1:]}
     assert run("--out", str(tmp_path)).returncode == 0
