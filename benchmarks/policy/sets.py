@@ -1,0 +1,241 @@
+"""The training sets: what each row of the table trains on, as LeRobot datasets with pictures of one codec.
+
+A further row is one entry of `ROWS`. Demonstrations (states of the simulator, from which exact pictures of any camera
+follow) are kept outside the datasets: the product sees a recording of two cameras and nothing else.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+from .cameras import Placement, intrinsics, product_pose, random_placement, table_homography
+from .forms import Form
+from .store import Store
+
+if TYPE_CHECKING:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from .scene import Scene
+    from .task import Demonstration
+
+FRONT, WRIST = "observation.images.front", "observation.images.wrist"
+RECORDED = "recorded"
+WITHOUT_JOINTS = "--camera.by_robot=false"
+Episode = tuple["Demonstration", Iterable[np.ndarray]]  # and the front pictures [h, w, 3] of its frames
+
+
+class Sets:
+    """Makes the training sets that are asked for, once."""
+
+    def __init__(self, store: Store, form: Form, workers: int) -> None:
+        """Nothing is made before it is asked for; `workers` are those of the product's command."""
+        self.store, self.form, self.workers = store, form, workers
+        self._scene: Scene | None = None
+
+    @property
+    def scene(self) -> "Scene":
+        """The simulated scene."""
+        if self._scene is None:
+            from .scene import Scene
+            from .task import SCENE_XML
+
+            self._scene = Scene(SCENE_XML, self.form)
+        return self._scene
+
+    def demonstrations(self) -> list["Demonstration"]:
+        """The expert's episodes."""
+        from .task import Demonstration, Task
+
+        def make(path: Path) -> None:
+            episodes = enumerate(Task().demonstrations(self.form.episodes))
+            arrays: dict[str, Any] = {f"{name}_{i}": value for i, one in episodes for name, value in vars(one).items()}
+            np.savez_compressed(path, **arrays)
+
+        with np.load(self.store.made("demonstrations.npz", make)) as file:
+            names = Demonstration.__dataclass_fields__
+            return [Demonstration(**{name: file[f"{name}_{i}"] for name in names}) for i in range(self.form.episodes)]
+
+    def folder(self, row: "Row") -> Path:
+        """The dataset that a row trains on."""
+        return self.store.made(f"sets/{row.dataset}", lambda path: row.make(self, path))
+
+    def write(self, root: Path, episodes: Iterable[Episode], *, wrist: bool = False) -> None:
+        """Records episodes through LeRobot's own API."""
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+        from lerobot_msdyn.dataset.video import tamed_av1
+
+        from .task import FPS, JOINTS, TASK
+
+        picture = {
+            "dtype": "video",
+            "shape": (self.form.height, self.form.width, 3),
+            "names": ["height", "width", "channels"],
+        }
+        vector = {"dtype": "float32", "shape": (len(JOINTS),), "names": [f"{name}.pos" for name in JOINTS]}
+        features = {"observation.state": vector, "action": dict(vector), FRONT: picture}
+        if wrist:
+            features[WRIST] = dict(picture)
+        dataset = LeRobotDataset.create(
+            "local/policy", FPS, features, root=root, robot_type="so101_follower", video_backend="pyav"
+        )
+        for demonstration, pictures in episodes:
+            for t, front in enumerate(pictures):
+                row = {"observation.state": demonstration.state[t], "action": demonstration.action[t], "task": TASK}
+                if wrist:
+                    row[WRIST] = self.scene.pictures(demonstration.qpos[t], wrist=True)[0]
+                dataset.add_frame(row | {FRONT: front})
+            with tamed_av1():
+                dataset.save_episode(parallel_encoding=False)
+        dataset.finalize()
+
+    def rendered(self, demonstration: "Demonstration", pose: np.ndarray) -> Iterator[np.ndarray]:
+        """The exact pictures of an episode from a world-from-camera pose."""
+        return (self.scene.pictures(qpos, pose)[0] for qpos in demonstration.qpos)
+
+    def random_poses(self, episode: int) -> list[np.ndarray]:
+        """The level poses of the oracle and of the homography."""
+        form, rng = self.form, np.random.default_rng([episode, 21])
+        bounds = form.range_deg, form.range_deg / 3, form.range_m
+        return [random_placement(rng, *bounds).world_from_camera() for _ in range(form.variants)]
+
+
+def recorded(sets: Sets, path: Path) -> None:
+    """The demonstrations as they are recorded; only here, where the product copies it, is the wrist camera."""
+    pose = Placement().world_from_camera()
+    sets.write(path, ((one, sets.rendered(one, pose)) for one in sets.demonstrations()), wrist=True)
+
+
+def oracle(sets: Sets, path: Path) -> None:
+    """With each episode, exact pictures of it from random level poses."""
+    poses = [[Placement().world_from_camera(), *sets.random_poses(i)] for i in range(sets.form.episodes)]
+    _write_rendered(sets, path, poses)
+
+
+def _write_rendered(sets: Sets, path: Path, poses: list[list[np.ndarray]]) -> None:
+    demonstrations = sets.demonstrations()
+    sets.write(path, ((one, sets.rendered(one, p)) for one, of in zip(demonstrations, poses, strict=True) for p in of))
+
+
+def homography(sets: Sets, path: Path) -> None:
+    """With each episode, its recorded pictures warped to the oracle's poses as if all lay on the table."""
+    source = opened(sets.folder(ROWS[RECORDED]))
+    form, K, base = sets.form, intrinsics(sets.form.width, sets.form.height), Placement().world_from_camera()
+
+    def episodes() -> Iterator[Episode]:
+        for index, one in enumerate(sets.demonstrations()):
+            frames = front_pictures(source, index)
+            yield one, sets.rendered(one, base)
+            for pose in sets.random_poses(index):
+                H = table_homography(base, pose, K)
+                size, mode = (form.width, form.height), cv2.BORDER_REPLICATE
+                yield one, [cv2.warpPerspective(frame, H, size, borderMode=mode) for frame in frames]
+
+    sets.write(path, episodes())
+
+
+def opened(root: Path) -> "LeRobotDataset":
+    """A training set."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    return LeRobotDataset("local/policy", root=root, video_backend="pyav")
+
+
+def front_pictures(dataset: "LeRobotDataset", episode: int) -> list[np.ndarray]:
+    """The front camera's decoded pictures [h, w, 3] of an episode."""
+    from lerobot.datasets.video_utils import decode_video_frames
+
+    row = dataset.meta.episodes[episode]
+    times = row[f"videos/{FRONT}/from_timestamp"] + np.arange(row["length"]) / dataset.fps
+    path = dataset.root / dataset.meta.get_video_file_path(episode, FRONT)
+    decoded = decode_video_frames(path, times.tolist(), dataset.tolerance_s, "pyav", return_uint8=True)
+    return list(decoded.permute(0, 2, 3, 1).numpy())
+
+
+def product(sets: Sets, path: Path, flags: tuple[str, ...] = (WITHOUT_JOINTS,)) -> None:
+    """What the package's command makes of the recording, with its defaults but for the given flags."""
+    source = sets.folder(ROWS[RECORDED])
+    given = [f"--root={source}", f"--new_root={path}", "--new_repo_id=local/policy_msdyn", "--repo=local/policy"]
+    given += [f"--variants={sets.form.variants}", f"--workers={sets.workers}"]
+    command = [sys.executable, "-m", "lerobot_msdyn.augment", *given]
+    environment = os.environ | {"LEROBOT_MSDYN_CACHE": str(sets.store.root / "priors"), "HF_HUB_OFFLINE": "1"}
+    log = sets.store.root / "augment.log"
+    with log.open("a") as file:
+        done = subprocess.run([*command, *sets.form.product, *flags], env=environment, stdout=file, stderr=file)
+    if done.returncode not in (0, 1) or not path.exists():  # 1: some views were rejected, which is part of the product
+        sys.exit(f"augment ended with {done.returncode}; {log} says why")
+
+
+def oracle_at_poses_of(name: str, sets: Sets, path: Path) -> None:
+    """With each episode, exact pictures of it from the poses that a row of the product chose."""
+    from lerobot_msdyn.dataset.provenance import read_provenance
+
+    base = Placement().world_from_camera()
+    poses: list[list[np.ndarray]] = [[base] for _ in range(sets.form.episodes)]
+    for episode in read_provenance(sets.folder(ROWS[name])) or []:
+        if episode["variant"] >= 0:
+            view, amounts = (json.loads(episode[column])[FRONT] for column in ("views", "perturbation"))
+            poses[episode["source_episode"]].append(product_pose(view, amounts))
+    _write_rendered(sets, path, poses)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One way to train: a dataset, and how it is used."""
+
+    dataset: str
+    make: Callable[[Sets, Path], None]
+    transforms: bool = True  # LeRobot's image transforms
+    variants: int | None = None  # new episodes per recorded one that are used; None: all
+    source: bool = True  # whether the recorded episodes are used
+
+    def keeps(self, variant: int) -> bool:
+        """Whether an episode is used, by its number among those of one recording; -1 is the recording."""
+        return self.source if variant < 0 else self.variants is None or variant < self.variants
+
+
+ROWS: dict[str, Row] = {
+    RECORDED: Row(RECORDED, recorded, transforms=False),
+    "transforms": Row(RECORDED, recorded),
+    "oracle": Row("oracle", oracle),
+    "homography": Row("homography", homography),
+    "product": Row("product", product),
+    "product with joints": Row("product_joints", partial(product, flags=("--robot.name=so101",))),
+    "oracle at the product's poses": Row("oracle_product", partial(oracle_at_poses_of, "product")),
+}
+
+
+def _swept(name: str, field: str, values: Iterable[Any]) -> dict[str, Row]:
+    """Rows of the product with one flag changed."""
+    return {
+        f"{name} {value}": Row(
+            f"product_{name}_{value}", partial(product, flags=(WITHOUT_JOINTS, f"--{field}={value}"))
+        )
+        for value in values
+    }
+
+
+_many = partial(product, flags=(WITHOUT_JOINTS, "--variants=10"))  # the first n of more variants are those of n
+SWEEPS: dict[str, dict[str, Row]] = {
+    "range": _swept("range", "perturbation.azimuth_deg", (5, 10, 15, 20, 30)),
+    "sampling": {
+        "one pose per episode": ROWS["product"],
+        "one pose per frame": Row(
+            "product_per_frame", partial(product, flags=(WITHOUT_JOINTS, "--perturbation.per_frame=true"))
+        ),
+        "without the recorded episodes": Row("product", product, source=False),
+    },
+    "variants": {f"variants {n}": Row("product_variants_10", _many, variants=n) for n in (1, 2, 3, 6, 10)},
+    "max_unseen": _swept("max_unseen", "max_unseen", (0.05, 0.1, 0.2, 0.4, 1.0)),
+    "fill": _swept("fill", "fill", ("inpaint", "nearest", "none")),
+    "gate": _swept("min_expected_db", "gate.min_expected_db", (0, 12, 14, 16, 18)),
+}
