@@ -4,7 +4,6 @@ python -m lerobot_msdyn.augment --repo local/ds
 """
 
 import logging
-import shutil
 import sys
 import time
 from pathlib import Path
@@ -146,6 +145,7 @@ def augment(
     from lerobot_msdyn.augment.failures import one_line_each
     from lerobot_msdyn.augment.report.build import entries_of, write_report
     from lerobot_msdyn.augment.report.page import accounts_of
+    from lerobot_msdyn.augment.robot_cameras import publish
     from lerobot_msdyn.augment.run import run_local
     from lerobot_msdyn.augment.run_identity import recipe_text
     from lerobot_msdyn.dataset.provenance import CALIBRATION, FOLDER, SOURCE_VARIANT
@@ -171,8 +171,7 @@ def augment(
             raise EpisodeError(f"no episode could be augmented; nothing was written. First: {first}")
 
         def report(folder: Path) -> Path:
-            if (staging.folder / CALIBRATION).is_dir():
-                shutil.copytree(staging.folder / CALIBRATION, folder / FOLDER / CALIBRATION)
+            publish(staging.folder / CALIBRATION, folder / FOLDER / CALIBRATION)
             seconds = time.perf_counter() - start
             return write_report(source, folder, new_root.name, made, skipped, len(failures), seconds)
 

@@ -24,7 +24,7 @@ from lerobot_msdyn.core.files import cache_folder, write_whole
 from lerobot_msdyn.core.sampling import REFERENCE_WIDTH, evenly
 from lerobot_msdyn.dataset.checks import picture_size
 from lerobot_msdyn.dataset.read import read_colour
-from lerobot_msdyn.dataset.rows import read_rows
+from lerobot_msdyn.dataset.rows import read_rows, values_of
 from lerobot_msdyn.priors.camera.stands import is_displaced
 from lerobot_msdyn.priors.masks.robot import RobotPictures
 from lerobot_msdyn.robots import JointMap, Robot, find_description, load_robot, map_joints
@@ -53,7 +53,7 @@ class Place:
     """Where a camera stood in some episodes, and what its pictures say of it."""
 
     episodes: list[int]
-    frames: Frames  # that were looked at; none where there are too few
+    frames: Frames  # that were looked at
     pictures: UInt8[ndarray, "k h w 3"]  # at most 320 wide
     verdict: Verdict | None = None
     joints: Float64[ndarray, "k j"] | None = None  # their values (rad, m) in these frames, as the verdict has them
@@ -161,6 +161,16 @@ def calibrated(
     return replace(config, camera=replace(config.camera, calibration=path))
 
 
+def publish(folder: Path, place: Path) -> None:
+    """Copies what `calibrated` wrote, if it wrote anything, without the user's folders, to a place in the output."""
+    for path in sorted(folder.glob("*.png")):
+        write_whole(place / path.name, path.read_bytes())
+    if (folder / NAME).exists():
+        content = json.loads((folder / NAME).read_text())
+        content["robot"]["urdf"] = Path(content["robot"]["urdf"]).name
+        write_whole(place / NAME, json.dumps(content, indent=1).encode())
+
+
 def calibration_episodes(source: LeRobotDatasetMetadata, config: AugmentConfig) -> list[int]:
     """The episodes that tell where cameras stand, beside those that are worked on; none where that is known."""
     wanted = config.camera.by_robot and config.camera.calibration is None
@@ -200,8 +210,7 @@ def robot_cameras(
         places[key] = []
         for group in groups:
             own = {index: states[index] for index in _some(group, max_episodes) if index in states}
-            chosen = _spread(robot, mapping, own, frames)
-            places[key].append(Place(group, chosen, _pictures(source, key, chosen)))
+            places[key].append(Place(group, *_pictures(source, key, _spread(robot, mapping, own, frames))))
     longest = max(len(place.pictures) for of_camera in places.values() for place in of_camera)
     if longest < MIN_FRAMES:
         raise DatasetError(f"{source.repo_id}: {longest} frames; expected at least {MIN_FRAMES}: add episodes")
@@ -243,8 +252,8 @@ def places_of(source: LeRobotDatasetMetadata, key: str, episodes: Sequence[int])
     return [group for _, group in places]
 
 
-def values_of(
-    mapping: JointMap, states: States, frames: Frames, fps: int | float
+def joints_in(
+    frames: Frames, mapping: JointMap, states: States, fps: int | float
 ) -> tuple[Float64[ndarray, "k j"], Float64[ndarray, "k j"]]:
     """Values of the joints in some frames (rad, m), and their change per second."""
     values, rates = [], []
@@ -275,8 +284,8 @@ def _states(source: LeRobotDatasetMetadata, episodes: Sequence[int]) -> States:
     states = {}
     for index in episodes:
         with contextlib.suppress(EpisodeError):
-            rows = read_rows(source, index)[OBS_STATE].to_pylist()
-            states[index] = np.stack([np.atleast_1d(np.asarray(row, np.float64)) for row in rows])
+            values = values_of(read_rows(source, index), OBS_STATE, source.features[OBS_STATE])
+            states[index] = values.astype(np.float64).reshape(len(values), -1)
     if not states:
         raise DatasetError(f"{source.repo_id}: none of the episodes tells where its cameras stand")
     return states
@@ -303,15 +312,21 @@ def _spread(robot: Robot, mapping: JointMap, states: States, count: int) -> Fram
     return {index: sorted(frames) for index, frames in sorted(chosen.items())}
 
 
-def _pictures(source: LeRobotDatasetMetadata, key: str, frames: Frames) -> UInt8[ndarray, "k h w 3"]:
-    """Frames of a camera, at most 320 wide."""
+def _pictures(source: LeRobotDatasetMetadata, key: str, frames: Frames) -> tuple[Frames, UInt8[ndarray, "k h w 3"]]:
+    """Frames of a camera, at most 320 wide, of the episodes in which they can be read."""
+    readable: Frames = {}
     pictures = []
     for index, chosen in frames.items():
-        rgb = read_colour(source, index, key, read_rows(source, index), chosen).numpy()
+        try:
+            rgb = read_colour(source, index, key, read_rows(source, index), chosen).numpy()
+        except EpisodeError as error:
+            logger.info("%s", error)
+            continue
+        readable[index] = chosen
         height, width = rgb.shape[1:3]
         size = (min(width, REFERENCE_WIDTH), round(height * min(1.0, REFERENCE_WIDTH / width)))
         pictures += [cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in rgb]
-    return np.stack(pictures) if pictures else np.zeros((0, 1, 1, 3), np.uint8)
+    return readable, np.stack(pictures) if pictures else np.zeros((0, 1, 1, 3), np.uint8)
 
 
 def _mappings(robot: Robot, mapping: JointMap, states: States, config: RobotConfig) -> list[JointMap]:
@@ -325,7 +340,7 @@ def _mappings(robot: Robot, mapping: JointMap, states: States, config: RobotConf
 def _solved(robot: Robot, mapping: JointMap, place: Place, states: States, fps: int | float) -> Place:
     if len(place.pictures) < MIN_FRAMES:
         return place
-    values, rates = values_of(mapping, states, place.frames, fps)
+    values, rates = joints_in(place.frames, mapping, states, fps)
     verdict = solve(robot, values, rates, RobotPictures(place.pictures))
     return replace(place, verdict=verdict, joints=verdict.solution.values(values, rates))
 

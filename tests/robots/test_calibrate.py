@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import augment_command as augment
 import numpy as np
@@ -12,10 +13,11 @@ from filmed_arm import FRONT, HEIGHT, NAMES, WIDTH, camera, write_filmed
 from made_up_arms import swing
 
 from lerobot_msdyn import calibrate
+from lerobot_msdyn.augment import robot_cameras
 from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.augment.robot_cameras import NAME, Place, RobotCameras, calibrated, places_of
-from lerobot_msdyn.core.config import CameraConfig, PriorsConfig
-from lerobot_msdyn.core.errors import ConfigError, DatasetError, PriorError
+from lerobot_msdyn.core.config import CameraConfig, PriorsConfig, RobotConfig
+from lerobot_msdyn.core.errors import ConfigError, DatasetError, EpisodeError, PriorError
 from lerobot_msdyn.dataset.calibration import read_calibration
 from lerobot_msdyn.dataset.provenance import CALIBRATION, FOLDER, TABLE
 from lerobot_msdyn.dataset.read import open_source, read_episode
@@ -24,6 +26,7 @@ from lerobot_msdyn.robots import Robot, map_joints
 from lerobot_msdyn.robots.calibration.refine import Solution
 from lerobot_msdyn.robots.calibration.solve import Verdict
 
+JOINTS = (np.zeros(6), np.ones(6))
 POSE = camera(-50, 25, 0.9, 50)
 
 
@@ -153,6 +156,7 @@ def test_new_views_by_the_arm(recorded: Path, urdf: Path, tmp_path: Path) -> Non
     assert "the table that the robot stands on" in row["priors"]
     assert "as its author gives it" in row["priors"]
     content = json.loads((out / FOLDER / CALIBRATION / NAME).read_text())
+    assert content["robot"]["urdf"] == urdf.name
     assert np.array(content["cameras"][FRONT]["R"]) == pytest.approx(POSE.rotation, abs=0.02)
     assert "links_front" in (out / "report.html").read_text()
 
@@ -169,11 +173,33 @@ def test_a_robot_that_is_not_known_is_no_obstacle(recorded: Path, tmp_path: Path
     assert list(tmp_path.iterdir()) == []
 
 
+def test_an_episode_whose_pictures_are_broken_is_left_out(
+    recorded: Path, urdf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = robot_cameras.read_colour
+
+    def broken(source: Any, index: int, key: str, rows: Any, frames: Any) -> Any:
+        if index == 1 and len(frames) > 2:
+            raise EpisodeError("episode 1: broken in the middle")
+        return whole(source, index, key, rows, frames)
+
+    monkeypatch.setattr(robot_cameras, "read_colour", broken)
+    monkeypatch.setattr(
+        robot_cameras, "solve", lambda robot, values, *_: Verdict(Solution(POSE, *JOINTS), 1.0, 1.0, "", 0.0)
+    )
+    found = robot_cameras.robot_cameras(
+        open_source("local/arm", recorded), [FRONT], [0, 1], RobotConfig(urdf=urdf), frames=40
+    )
+    (place,) = found.places[FRONT]
+    assert list(place.frames) == [0]
+    assert len(place.pictures) == len(place.frames[0])
+
+
 def test_each_place_of_a_camera_has_an_entry_or_none(arm: Robot, urdf: Path, tmp_path: Path) -> None:
     moved = ((0, 0), (12, 12), (0, 0), (0, 12))
     source = open_source("local/arm", write_filmed(tmp_path / "arm", arm, POSE, 4, 8, moved_px=moved))
     assert places_of(source, FRONT, range(4)) == [[0, 2], [1]]
-    solution = Solution(POSE, np.zeros(6), np.ones(6))
+    solution = Solution(POSE, *JOINTS)
     sure, unsure = (Verdict(solution, 0.9, 0.2, doubt, 1.0) for doubt in ("", "another camera fits as well"))
     nothing = np.zeros((0, 1, 1, 3), np.uint8)
     mapping = map_joints(arm, NAMES, swing(24, 0))
