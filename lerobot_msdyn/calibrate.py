@@ -30,8 +30,8 @@ class CalibrateConfig:
     root: Path | None = None
     # Cameras, by feature key or its last part; default: all but wrist cameras.
     cameras: list[str] | None = None
-    # Episodes, e.g. 0 or '[0,3]'; default: all. Where a camera was moved between them, each place is found by itself.
-    episodes: list[int] | int | None = None
+    # Episodes, e.g. 0, 0,3 or 0-9; default: all. Where a camera was moved between them, each place is found by itself.
+    episodes: list[int] | None = None
     # At most so many episodes of each place are looked at closely, evenly spread.
     max_episodes: int = between(10, 1, 1000)
     # Frames that are looked at of each place.
@@ -54,8 +54,7 @@ def run(arguments: list[str]) -> int:
     from lerobot_msdyn.dataset.select import select_cameras, select_episodes
 
     source = open_source(config.repo_id, config.root)
-    wanted = [config.episodes] if isinstance(config.episodes, int) else config.episodes
-    episodes = select_episodes(source, wanted)
+    episodes = select_episodes(source, config.episodes)
     keys = select_cameras(source, config.cameras)
     found = robot_cameras(source, keys, episodes, config.robot, config.frames, config.max_episodes)
     for name, where, place in found.named():

@@ -1,6 +1,6 @@
 """Command line: the recipes that come with the package, and whether one of your own is right.
 
-python -m lerobot_msdyn.recipes ls | show NAME | check FILE
+python -m lerobot_msdyn.recipes list | show NAME | check FILE
 """
 
 import sys
@@ -10,7 +10,7 @@ from lerobot_msdyn.core.cli import EXIT_OK, load_recipe, run_command
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.core.recipe_files import packaged_recipes, recipe_path
 
-USAGE = """usage: python -m lerobot_msdyn.recipes ls           name and purpose of every recipe
+USAGE = """usage: python -m lerobot_msdyn.recipes list         name and purpose of every recipe
        python -m lerobot_msdyn.recipes show NAME    one recipe, to copy and change
        python -m lerobot_msdyn.recipes check FILE   whether a recipe's fields and values are right
 """
@@ -22,7 +22,7 @@ def run(arguments: list[str]) -> int:
         sys.stdout.write(USAGE)
         return EXIT_OK
     match arguments:
-        case ["ls"]:
+        case ["list" | "ls"]:
             sys.stdout.write("".join(f"{path.stem:14s}{purpose(path)}\n" for path in packaged_recipes()))
         case ["show", name]:
             sys.stdout.write(recipe_path(name).read_text(encoding="utf-8"))
@@ -30,7 +30,7 @@ def run(arguments: list[str]) -> int:
             load_recipe(name)
             sys.stdout.write(f"{recipe_path(name)}: all fields and values are right\n")
         case _:
-            raise ConfigError(f"recipes: got {' '.join(arguments)!r}; expected ls, show NAME or check FILE")
+            raise ConfigError(f"recipes: got {' '.join(arguments)!r}; expected list, show NAME or check FILE")
     return EXIT_OK
 
 

@@ -13,8 +13,9 @@ PROJECT = Path(__file__).parent.parent
 NAMES = ["balanced", "best", "multi_camera", "quick", "rgbd", "so101_front"]
 
 
-def test_ls_names_every_recipe_with_its_purpose(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["ls"]) == 0
+@pytest.mark.parametrize("name", ["list", "ls"])
+def test_list_names_every_recipe_with_its_purpose(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run([name]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == NAMES
     assert all(len(line.split()) > 4 for line in lines)

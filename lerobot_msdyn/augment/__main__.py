@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lerobot_msdyn.augment.config import AugmentConfig
+from lerobot_msdyn.augment.config import ESSENTIALS, AugmentConfig
 from lerobot_msdyn.core.cli import EXIT_INTERRUPTED, EXIT_OK, EXIT_SOME_EPISODES_FAILED, parse_config, run_command
 from lerobot_msdyn.core.errors import ConfigError, DatasetError, EpisodeError, MsdynError
 
@@ -26,7 +26,7 @@ ALIASES = {"repo": "repo_id"}
 
 def run(arguments: list[str]) -> int:
     """Augment a dataset; returns the exit code."""
-    config = parse_config(AugmentConfig, arguments, ALIASES, command=COMMAND)
+    config = parse_config(AugmentConfig, arguments, ALIASES, command=COMMAND, essentials=ESSENTIALS)
     if not config.repo_id:
         raise ConfigError(f"which dataset? {COMMAND} --repo NAME [--root FOLDER] (see --help)")
     # LeRobot and torch take seconds to import: only now, so that --help and bad flags are answered at once.

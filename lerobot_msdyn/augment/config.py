@@ -3,13 +3,14 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from lerobot_msdyn.core.command_help import Essentials
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.fields import between
 
 
 @dataclass
 class AugmentConfig(Recipe):
-    """`python -m lerobot_msdyn.augment`: a recipe and where to read and write."""
+    """`python -m lerobot_msdyn.augment`: new camera viewpoints for every episode of a LeRobot dataset."""
 
     # Source dataset (alias: --repo).
     repo_id: str = ""
@@ -19,7 +20,7 @@ class AugmentConfig(Recipe):
     new_repo_id: str | None = None
     # Exact folder of the new dataset; default: LeRobot's home, or beside --root.
     new_root: Path | None = None
-    # Source episodes to use, e.g. '[0,3]'; default: all.
+    # Source episodes to use, e.g. 0, 0,3 or 0-9; default: all.
     episodes: list[int] | None = None
     # How far (s) a video frame may be from its row's time, as LeRobot's tolerance_s; of no matter where a video has as
     # many frames as its episode has rows: these belong together by their number.
@@ -32,3 +33,13 @@ class AugmentConfig(Recipe):
     restart: bool = False
     # Work on a converted copy of a source of version v2.1; the source stays as it is.
     convert: bool = False
+
+
+ESSENTIALS = Essentials(
+    fields=("repo_id", "root", "new_repo_id", "episodes", "cameras", "variants", "dry_run", "workers", "device"),
+    examples=(
+        "--repo local/ds",
+        "--repo local/ds --episodes 0-2 --recipe quick",
+        "--repo local/ds --dry-run",
+    ),
+)

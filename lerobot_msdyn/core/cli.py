@@ -3,23 +3,24 @@
 import contextlib
 import dataclasses
 import difflib
-import inspect
 import logging
 import os
+import re
 import sys
 import typing
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
+from importlib.metadata import version
 from typing import Any
 
 import draccus
 import yaml
-from draccus.wrappers.docstring import get_attribute_docstring
 
+from lerobot_msdyn.core.command_help import Essentials, format_essentials, format_help
 from lerobot_msdyn.core.config import FORMER_FIELDS, Recipe
 from lerobot_msdyn.core.errors import ConfigError, MsdynError, one_line
 from lerobot_msdyn.core.fields import problems
 from lerobot_msdyn.core.plugins import import_plugins
-from lerobot_msdyn.core.recipe_files import packaged_recipes, read_recipe
+from lerobot_msdyn.core.recipe_files import read_recipe
 
 logger = logging.getLogger(__name__)
 
@@ -27,6 +28,7 @@ EXIT_OK = 0
 EXIT_SOME_EPISODES_FAILED = 1
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
+HELP = {"-h": False, "--help": False, "--help-all": True, "--help_all": True}  # whether every field is shown
 
 
 def load_recipe(name: str) -> Recipe:
@@ -38,23 +40,34 @@ def load_recipe(name: str) -> Recipe:
     return parse_config(Recipe, ["--recipe", name], {}, command="load_recipe")
 
 
-def parse_config[T](config_class: type[T], arguments: list[str], aliases: Mapping[str, str], *, command: str) -> T:
+def parse_config[T](
+    config_class: type[T],
+    arguments: list[str],
+    aliases: Mapping[str, str],
+    *,
+    command: str,
+    essentials: Essentials | None = None,
+) -> T:
     """The config that a command line describes: defaults, then `--recipe`, then the other flags.
 
-    Prints the help and exits on `-h` or `--help`.
+    Prints the help and exits on `-h`, `--help` (the essentials, where a command names them) or `--help-all`.
 
     Raises:
         ConfigError: unknown fields (all of them named at once), wrong types or values out of range.
     """
-    if "-h" in arguments or "--help" in arguments:
+    if any(item in HELP for item in arguments):
         plugins = []
         with contextlib.suppress(ConfigError):  # help is also for those whose flags are wrong
-            plugins = _split_flags([item for item in arguments if item not in ("-h", "--help")], aliases)[1]
+            plugins = _split_flags([item for item in arguments if item not in HELP], aliases)[1]
         import_plugins(plugins)
-        sys.stdout.write(format_help(config_class, aliases, command))
+        if essentials is None or any(HELP.get(item) for item in arguments):
+            sys.stdout.write(format_help(config_class, aliases, command))
+        else:
+            sys.stdout.write(format_essentials(config_class, aliases, command, essentials))
         sys.exit(EXIT_OK)
     recipe, plugins, overrides = _split_flags(arguments, aliases)
     import_plugins(plugins)
+    overrides = _lists(config_class, overrides)
     content: dict[str, Any] = draccus.encode(config_class())
     for part in ([read_recipe(recipe)] if recipe is not None else []) + [overrides]:
         unknown = _unknown_fields(config_class, _merge(content, part), part)
@@ -72,41 +85,40 @@ def parse_config[T](config_class: type[T], arguments: list[str], aliases: Mappin
     return typing.cast(T, config)
 
 
-def format_help(config_class: type, aliases: Mapping[str, str], command: str) -> str:
-    """The help text of a command: every field with its default and the comment that stands above it."""
-    names = ", ".join(f"--{alias} for --{name}" for alias, name in aliases.items())
-    recipes = ", ".join(path.stem for path in packaged_recipes())
-    head = (
-        f"usage: {command} [--field value ...]\n\n{inspect.getdoc(config_class)}\n\n"
-        f"  --recipe NAME_OR_FILE\n      A YAML file with any of the fields below, read before the flags; "
-        f"by name: {recipes}.\n  --plugins MODULE_OR_FILE.py\n      Your own providers, motion levels, perturbations "
-        f"or loss terms, imported before the recipe is read (docs/extending.md).\n\nShort names: {names}.\n"
-        "Exit codes: 0 done, or finished before; 1 some episodes or views were left out; 2 bad input; "
-        "130 interrupted.\n"
-    )
-    return head + "".join(_help_lines(config_class, ""))
+def listed(value: object, item: type) -> object:
+    """What a flag gives for a field that is a list: one value, values between commas, and ranges such as 0-9.
+
+    Raises:
+        ConfigError: a range that ends before it begins.
+    """
+    if isinstance(value, str) and value:
+        return [part for text in value.split(",") for part in _range(text.strip(), item)]
+    return [value] if isinstance(value, int) and item is int else value
 
 
-def _help_lines(config_class: type, prefix: str) -> Iterator[str]:
+def _range(text: str, item: type) -> list[Any]:
+    found = re.fullmatch(r"(\d+)-(\d+)", text) if item is int else None
+    if found is None:
+        return [int(text)] if item is int and text.isdecimal() else [text]
+    first, last = map(int, found.groups())
+    if last < first:
+        raise ConfigError(f"{text!r} is no range: it ends before it begins; expected {last}-{first}")
+    return list(range(first, last + 1))
+
+
+def _lists(config_class: type, part: dict[str, Any]) -> dict[str, Any]:
+    """`part` with lists where the config's own fields are lists and less was typed."""
     hints = typing.get_type_hints(config_class)
-    for item in dataclasses.fields(config_class):
-        name, hint = prefix + item.name, hints[item.name]
-        text = get_attribute_docstring(config_class, item.name).comment_above
-        if not dataclasses.is_dataclass(hint):
-            kind = getattr(hint, "__name__", str(hint)) if isinstance(hint, type) else str(hint)
-            kind = kind.replace("typing.", "").replace("pathlib.", "").replace("NoneType", "None")
-            yield f"  --{name} {kind} (default: {_default(item)})\n      {text}\n"
-        elif issubclass(typing.cast(Any, hint), draccus.ChoiceRegistry):
-            for kind, choice in sorted(typing.cast(Any, hint).get_known_choices().items()):
-                yield f"\n--{name}.type {kind}: {inspect.getdoc(choice)}\n"
-                yield from _help_lines(choice, f"{name}.")
-        else:
-            yield f"\n{name}: {inspect.getdoc(typing.cast(type, hint))}\n"
-            yield from _help_lines(typing.cast(type, hint), f"{name}.")
+    items = {name: _item_of(hint) for name, hint in hints.items()}
+    return {name: value if items.get(name) is None else listed(value, items[name]) for name, value in part.items()}
 
 
-def _default(item: dataclasses.Field) -> object:
-    return item.default if item.default_factory is dataclasses.MISSING else item.default_factory()
+def _item_of(hint: object) -> Any:
+    """T where a hint is list[T] or list[T] | None, else None."""
+    for option in (hint, *typing.get_args(hint)):
+        if typing.get_origin(option) is list:
+            return typing.get_args(option)[0]
+    return None
 
 
 def run_command(main: Callable[[list[str]], int], arguments: list[str] | None = None) -> None:
@@ -121,8 +133,12 @@ def run_command(main: Callable[[list[str]], int], arguments: list[str] | None = 
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s", stream=sys.stderr)
     for name in ("lerobot", "httpx"):
         logging.getLogger(name).setLevel(logging.WARNING)
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments == ["--version"]:
+        sys.stdout.write(f"lerobot_msdyn {version('lerobot_msdyn')}\n")
+        sys.exit(EXIT_OK)
     try:
-        code = main(sys.argv[1:] if arguments is None else arguments)
+        code = main(arguments)
     except MsdynError as error:
         sys.stderr.write(f"error: {one_line(error)}\n")
         code = EXIT_BAD_INPUT
@@ -143,6 +159,7 @@ def _split_flags(arguments: list[str], aliases: Mapping[str, str]) -> tuple[str 
         if not flag.startswith("--") or len(flag) == 2:
             raise ConfigError(f"unexpected argument {flag!r}; expected --field value (see --help)")
         name, equals, text = flag[2:].partition("=")
+        name = name.replace("-", "_") if name not in aliases else name
         if not equals:  # a flag without a value is a switch
             text = rest.pop(0) if rest and not rest[0].startswith("--") else "true"
         if name == "recipe":

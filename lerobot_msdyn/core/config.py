@@ -282,7 +282,7 @@ class Recipe:
     save_scenes: bool = False
     # Seed of every random choice; together with the episode and the variant it fixes the result.
     seed: int = between(0, 0, MAX_SEED)
-    # auto, cpu or cuda; auto takes a GPU where everything is there to draw on it (docs/render.md).
+    # Where it runs: auto, cpu or cuda; auto takes a GPU where everything is there to draw on it (docs/render.md).
     device: Device = "auto"
     # Whether a GPU encodes new H.264 and HEVC videos where it can: faster, but not as the source's encoder would.
     nvenc: bool = False

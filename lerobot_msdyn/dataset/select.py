@@ -1,11 +1,16 @@
 """Which episodes and cameras of a dataset are worked on: those asked for, or all that may be re-rendered."""
 
+import re
+
 from lerobot.datasets import LeRobotDatasetMetadata
 
 from lerobot_msdyn.core.errors import DatasetError
 from lerobot_msdyn.dataset.checks import read_json
 
-ON_ROBOT = ("wrist", "hand", "gripper", "palm", "finger", "effector", "flange", "tool")  # in names of cameras
+# Words in names of cameras: wrist, left_wrist, handcam, eye_in_hand, gripper2; but not handover or toolbox.
+ON_ROBOT = re.compile(
+    r"(?<![a-z])(left|right|l|r)?(wrist|hand|gripper|palm|finger|effector|flange|tool)s?(cam|camera|eye|view)?(?![a-z])"
+)
 
 
 def select_episodes(meta: LeRobotDatasetMetadata, episodes: list[int] | None) -> list[int]:
@@ -72,5 +77,5 @@ def select_cameras(meta: LeRobotDatasetMetadata, cameras: list[str] | None, *, a
 
 def is_wrist_camera(key: str) -> bool:
     """Whether a camera's name says that it moves with the robot."""
-    name = key.rsplit(".", 1)[-1].lower()
-    return any(word in name for word in ON_ROBOT)
+    name = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", key.rsplit(".", 1)[-1])  # wristCamera
+    return ON_ROBOT.search(name.lower()) is not None

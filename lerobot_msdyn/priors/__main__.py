@@ -31,8 +31,8 @@ class PriorsCommandConfig(Recipe):
     repo_id: str = ""
     # Exact folder of the source dataset; default: LeRobot's home, then the hub.
     root: Path | None = None
-    # Episodes, e.g. 0 or '[0,3]'; default: all.
-    episodes: list[int] | int | None = None
+    # Episodes, e.g. 0, 0,3 or 0-9; default: all.
+    episodes: list[int] | None = None
     # Where the results go: OUT/episode_000000/<camera>.npz and OUT/episode_000000.png.
     out: Path = Path()
     # Columns of the contact sheet.
@@ -53,8 +53,7 @@ def run(arguments: list[str]) -> int:
 
     source = open_source(config.repo_id, config.root)
     cameras = select_cameras(source, config.cameras)
-    wanted = [config.episodes] if isinstance(config.episodes, int) else config.episodes
-    episodes = select_episodes(source, wanted)
+    episodes = select_episodes(source, config.episodes)
     failures = []
     for index in episodes:
         try:

@@ -2,10 +2,14 @@
 
 import subprocess
 import sys
+from importlib.metadata import version
 
 import pytest
 
-COMMANDS = ["augment", "evaluate", "priors", "split", "carry", "recipes", "viewer"]
+from lerobot_msdyn.augment.__main__ import run as augment
+from lerobot_msdyn.core.cli import run_command
+
+COMMANDS = ["augment", "evaluate", "priors", "split", "carry", "recipes", "viewer", "export_ply", "__main__"]
 HOMES = {"augment": "augment.__main__", "evaluate": "evaluate.__main__", "priors": "priors.__main__"}
 
 
@@ -42,6 +46,13 @@ except SystemExit: pass
 print(os.environ["OMP_WAIT_POLICY"])
 """
     assert in_a_new_process(code).endswith("ACTIVE\n")
+
+
+def test_the_version_is_the_installed_one(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        run_command(augment, ["--version"])
+    assert end.value.code == 0
+    assert capsys.readouterr().out == f"lerobot_msdyn {version('lerobot_msdyn')}\n"
 
 
 @pytest.mark.slow

@@ -15,8 +15,9 @@ import draccus
 import pytest
 import yaml
 
-from lerobot_msdyn.augment.config import AugmentConfig
-from lerobot_msdyn.core.cli import format_help, parse_config
+from lerobot_msdyn.augment.config import ESSENTIALS, AugmentConfig
+from lerobot_msdyn.core.cli import parse_config
+from lerobot_msdyn.core.command_help import format_essentials, format_help
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.core.fields import problems
@@ -77,7 +78,7 @@ def test_another_perturbation_type_drops_the_fields_of_the_old_one() -> None:
         (["--motion.levels", "[flat,object]"], "motion.levels is"),
         (["--motion.levels", "[objects]"], "motion.levels.*objects"),
         (["--motion.flat_bases", "10"], "motion.flat_bases is a field no more: leave it out, or .*settings.flat.bases"),
-        (["--cameras", "front"], "cameras.*front.*list"),
+        (["--cameras", "{a: b}"], "cameras.*list"),
         (["--repo", "[1]"], r"'repo_id' is \[1\]; expected text"),
         (["--include_source", "maybe"], "include_source.*maybe.*bool"),
         (["--perturbation.type", "shake"], "perturbation.type is 'shake'; expected one of dolly, drift, focal, jitter"),
@@ -237,13 +238,59 @@ def test_a_number_out_of_range_is_refused_by_every_command(name: str, arguments:
 def test_help_answers_without_importing_torch() -> None:
     code = (
         "import sys, lerobot_msdyn.augment.__main__ as a\n"
-        "try: a.run(['--help'])\n"
-        "except SystemExit: pass\n"
+        "for flag in ('--help', '--help-all'):\n"
+        "    try: a.run([flag])\n"
+        "    except SystemExit: pass\n"
         "assert 'torch' not in sys.modules"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "--fit.steps" in done.stdout
+
+
+def test_the_short_help_fits_a_screen_and_shows_what_is_typed() -> None:
+    lines = format_essentials(AugmentConfig, {"repo": "repo_id"}, "augment", ESSENTIALS).splitlines()
+    assert len(lines) <= 25
+    assert max(map(len, lines)) <= 120
+    shown = {line.split()[0] for line in lines if line.startswith("  --")}
+    assert {"--repo", "--episodes", "--cameras", "--dry_run", "--recipe"} <= shown
+    assert "--repo_id" not in shown
+    assert sum(line.startswith("  augment ") for line in lines) == 3
+    assert all(len(line.split()) >= 3 for line in lines if line.startswith("  --"))
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_no_help_shows_what_only_python_knows(command: str) -> None:
+    text = format_help(CONFIGS[COMMANDS[command]], {}, command)
+    assert "MISSING" not in text
+    assert "<" not in text
+    assert "Short names: ." not in text
+
+
+@pytest.mark.parametrize(
+    ("typed", "expected"),
+    [("0", [0]), ("0,3", [0, 3]), ("2-4", [2, 3, 4]), ("0,2-3", [0, 2, 3]), ("[0, 3]", [0, 3]), ("null", None)],
+)
+def test_episodes_as_people_type_them(typed: str, expected: list[int] | None) -> None:
+    assert parse("--episodes", typed).episodes == expected
+
+
+@pytest.mark.parametrize(("typed", "expected"), [("front", ["front"]), ("front,side", ["front", "side"])])
+def test_cameras_as_people_type_them(typed: str, expected: list[str]) -> None:
+    assert parse("--cameras", typed).cameras == expected
+
+
+@pytest.mark.parametrize(
+    ("typed", "message"), [("3-1", "'3-1' is no range.*expected 1-3"), ("one", "one"), ("0;3", "0;3"), ("1.5", "1.5")]
+)
+def test_what_is_no_list_of_episodes_is_refused(typed: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        parse("--episodes", typed)
+
+
+def test_flags_with_dashes() -> None:
+    config = parse("--dry-run", "--fit.max-width=64", "--new-repo-id", "local/a-b")
+    assert (config.dry_run, config.fit.max_width, config.new_repo_id) == (True, 64, "local/a-b")
 
 
 def test_the_balanced_recipe_holds_the_defaults() -> None:

@@ -30,12 +30,16 @@ def test_episode_out_of_range(desk: Path) -> None:
         select_episodes(source, [0, 3, -1])
 
 
-@pytest.mark.parametrize("name", ["wrist", "left_hand", "gripper_cam", "eye_in_hand", "end_effector", "tool0"])
+@pytest.mark.parametrize(
+    "name", ["wrist", "left_hand", "gripper_cam", "eye_in_hand", "end_effector", "tool0", "handcam", "leftWrist"]
+)
 def test_names_of_cameras_on_the_robot(name: str) -> None:
     assert is_wrist_camera(f"observation.images.{name}")
 
 
-@pytest.mark.parametrize("name", ["front", "top", "overhead", "side", "laptop"])
+@pytest.mark.parametrize(
+    "name", ["front", "top", "overhead", "side", "laptop", "handover_view", "toolbox", "secondhand"]
+)
 def test_names_of_cameras_beside_the_robot(name: str) -> None:
     assert not is_wrist_camera(f"observation.images.{name}")
 

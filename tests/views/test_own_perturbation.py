@@ -21,7 +21,8 @@ from lerobot_msdyn.augment import __main__ as augment
 from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.core import plugins
 from lerobot_msdyn.core import registry as registry_module
-from lerobot_msdyn.core.cli import format_help, load_recipe, parse_config
+from lerobot_msdyn.core.cli import load_recipe, parse_config
+from lerobot_msdyn.core.command_help import format_help
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.core.perturbation import PERTURBATIONS, Perturbation
 from lerobot_msdyn.training import MixedViews
@@ -105,7 +106,7 @@ def test_flags_are_checked_and_explained(plugin: list[str]) -> None:
 
 def test_help_lists_plugins(plugin: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        parse_config(AugmentConfig, [*plugin, "--help"], {}, command="a")
+        parse_config(AugmentConfig, [*plugin, "--help-all"], {}, command="a")
     assert "--perturbation.type swing: Swing the camera" in capsys.readouterr().out
 
 

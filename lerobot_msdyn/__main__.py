@@ -1,0 +1,46 @@
+"""All commands by one name: `lerobot-msdyn augment --repo local/ds`, or `python -m lerobot_msdyn augment ...`."""
+
+import difflib
+import importlib
+import sys
+
+from lerobot_msdyn.core.cli import EXIT_OK, run_command
+from lerobot_msdyn.core.errors import ConfigError
+
+COMMANDS = {  # name -> module, purpose
+    "augment": ("augment.__main__", "write new episodes of a dataset, seen from displaced cameras"),
+    "viewer": ("viewer", "look at an episode, its scene and its new views in Rerun"),
+    "priors": ("priors.__main__", "look at masks, depth and tracks of an episode"),
+    "calibrate": ("calibrate", "where the cameras stand, by the robot's joints"),
+    "recipes": ("recipes", "list, show and check recipes"),
+    "export-ply": ("export_ply", "frames of a kept scene as .ply files"),
+    "split": ("split", "train and evaluation episodes with no recording on both sides"),
+    "carry": ("carry", "provenance for datasets that LeRobot's tools made of others"),
+    "evaluate": ("evaluate.__main__", "score reconstructions on views that were not fitted"),
+}
+
+
+def run(arguments: list[str]) -> int:
+    """Run the command that the first argument names; returns its exit code."""
+    name, *rest = arguments or ["--help"]
+    if name in ("-h", "--help"):
+        width = max(map(len, COMMANDS))
+        lines = [f"  {each:{width}s}  {purpose}\n" for each, (_, purpose) in COMMANDS.items()]
+        sys.stdout.write(f"usage: lerobot-msdyn COMMAND ...\n\n{''.join(lines)}\nlerobot-msdyn COMMAND --help: more\n")
+        return EXIT_OK
+    known = name.replace("_", "-")
+    if known not in COMMANDS:
+        near = difflib.get_close_matches(known, COMMANDS, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(COMMANDS)}"
+        raise ConfigError(f"no command {name!r}; {hint}")
+    command = importlib.import_module(f"lerobot_msdyn.{COMMANDS[known][0]}")
+    return int(command.run(rest))
+
+
+def main() -> None:
+    """Entry point."""
+    run_command(run)
+
+
+if __name__ == "__main__":
+    main()
