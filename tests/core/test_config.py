@@ -263,7 +263,7 @@ def test_the_short_help_fits_a_screen_and_shows_what_is_typed() -> None:
 def test_no_help_shows_what_only_python_knows(command: str) -> None:
     text = format_help(CONFIGS[COMMANDS[command]], {}, command)
     assert "MISSING" not in text
-    assert "<" not in text
+    assert "<dataclasses" not in text
     assert "Short names: ." not in text
 
 
