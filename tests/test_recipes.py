@@ -66,9 +66,9 @@ def test_check_names_bad_values(tmp_path: Path, content: str, message: str) -> N
         run(["check", str(mine)])
 
 
-@pytest.mark.parametrize("arguments", [["show"], ["show", "a", "b"], ["list"], ["check"]])
+@pytest.mark.parametrize("arguments", [["show"], ["show", "a", "b"], ["lost"], ["check"]])
 def test_other_words_are_refused(arguments: list[str]) -> None:
-    with pytest.raises(ConfigError, match="expected ls, show NAME or check FILE"):
+    with pytest.raises(ConfigError, match="expected list, show NAME or check FILE"):
         run(arguments)
 
 
