@@ -5,7 +5,8 @@ unexport PYTHONDONTWRITEBYTECODE  # torch and lerobot compiled anew at every sta
 .PHONY: setup demo test lint clean
 
 PYTHON ?= $(shell command -v python || command -v python3)
-UV := $(shell command -v uv || echo .tools/bin/uv)
+# one that runs: a version manager's shim may belong to another Python
+UV := $(shell uv --version >/dev/null 2>&1 && command -v uv || echo .tools/bin/uv)
 VENV := .venv
 BIN := $(VENV)/bin
 EXTRAS := cuda,viz,priors,sfm,robots,evaluate,dev

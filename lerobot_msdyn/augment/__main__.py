@@ -149,6 +149,7 @@ def augment(
     from lerobot_msdyn.augment.run import run_local
     from lerobot_msdyn.augment.run_identity import recipe_text
     from lerobot_msdyn.dataset.provenance import CALIBRATION, FOLDER, SOURCE_VARIANT
+    from lerobot_msdyn.dataset.training_command import training_command
     from lerobot_msdyn.dataset.write import OutputDataset
     from lerobot_msdyn.reconstruction.account import account_line
     from lerobot_msdyn.views.camera_change import units_of_shifts
@@ -186,8 +187,7 @@ def augment(
         f"{units_of_shifts([episode.provenance.perturbation for episode in made])}"
         f"written to {new_root}\n"
         f"look at {new_root / 'report.html'}\n"
-        f"train:  lerobot-train --dataset.repo_id={new_repo_id} --dataset.root={new_root} --policy.type=act "
-        "--policy.push_to_hub=false\n",
+        f"train: {training_command(source, len(episodes) - len(failures), new_repo_id, new_root)}\n",
         left_out,
     )
 

@@ -29,6 +29,8 @@ class AugmentConfig(Recipe):
     workers: int = between(0, 0, 1024)
     # Report what would be done (episodes, disk, time) and stop.
     dry_run: bool = False
+    # Say what each stage finds in each episode, not only how each episode went.
+    verbose: bool = False
     # Throw away what an unfinished run for the same output has finished, instead of going on with it.
     restart: bool = False
     # Work on a converted copy of a source of version v2.1; the source stays as it is.

@@ -23,6 +23,7 @@ from lerobot_msdyn.dataset.rows import read_rows
 from lerobot_msdyn.dataset.staging import SCENE
 from lerobot_msdyn.dataset.write import NewEpisode, OutputDataset
 from lerobot_msdyn.priors.camera.path import displacement_px
+from lerobot_msdyn.reconstruction.account import account_line
 from lerobot_msdyn.reconstruction.reconstruct import reconstruct
 from lerobot_msdyn.reconstruction.result import Reconstruction
 from lerobot_msdyn.render.devices import chosen_device
@@ -98,6 +99,8 @@ def augment_episode(
     if recipe.save_scenes:
         for key, scene in scenes.items():
             store.save(scene.saved(SceneSource(source.repo_id, index, key, source.fps)), output.scenes)
+    for key, scene in scenes.items():
+        logger.info("episode %d, %s: %s", index, key, account_line(scene.account))
     return new
 
 

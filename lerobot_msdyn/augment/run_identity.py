@@ -26,7 +26,7 @@ from lerobot_msdyn.dataset.rows import data_files
 from lerobot_msdyn.render.devices import chosen_device
 
 LIBRARIES = ("lerobot_msdyn", "lerobot", "torch", "numpy", "opencv-python-headless", "av", "numba", "pyarrow")
-PLACES = ("root", "new_root", "dry_run", "restart", "workers")  # settings that do not change what is made
+PLACES = ("root", "new_root", "dry_run", "restart", "verbose", "workers")  # settings that do not change what is made
 
 
 def describe_run(root: Path, files: Iterable[Path], config: AugmentConfig) -> dict[str, Any]:

@@ -35,6 +35,7 @@ from lerobot_msdyn.render.devices import chosen_device
 MEMORY_EACH = 3e9  # bytes of a machine's memory that there must be for each worker
 GPU_MEMORY_EACH = 4e9  # bytes of a GPU's free memory; by arithmetic, not measured (docs/render.md)
 FRAMES_EACH = 200  # of work, for which starting a worker pays
+STAGES = ("priors", "robots", "motion", "reconstruction", "views")  # whose findings only --verbose shows
 
 
 @dataclass(frozen=True)
@@ -142,15 +143,26 @@ def _begin(place: _Place, threads: int, progress: Progress) -> Work:
     """Make a new process a worker."""
     for said_by_parent in (chosen_device, open_source):
         logging.getLogger(said_by_parent.__module__).setLevel(logging.ERROR)
+    config = _config_at(place)
+    if not config.verbose:
+        quieten_stages()
     tqdm.set_lock(threading.RLock())  # its own is for several processes, and left behind by one that ends at once
     torch.set_num_threads(threads)
     cv2.setNumThreads(threads)
     quiet_encoders()
-    config = _config_at(place)
     source = open_source(place.repo_id, place.root, config.tolerance_s)
     staging = Staging(place.new_root, lock=False)
     output = OutputDataset(source, place.new_repo_id, place.new_root, staging, nvenc=config.nvenc)
     return Work(source, place.cameras, config, output, progress)
+
+
+def quieten_stages() -> list[tuple[logging.Logger, int]]:
+    """From now on stages say only what is wrong; returns their loggers with the levels that they had."""
+    loggers = [logging.getLogger(f"lerobot_msdyn.{name}") for name in STAGES]
+    before = [(each, each.level) for each in loggers]
+    for each in loggers:
+        each.setLevel(logging.WARNING)
+    return before
 
 
 def _with_source(work: Work, call: tuple[Callable[[LeRobotDatasetMetadata, MaskTask], object], MaskTask]) -> object:

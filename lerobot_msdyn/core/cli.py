@@ -130,7 +130,9 @@ def run_command(main: Callable[[list[str]], int], arguments: list[str] | None = 
     # Idle OpenMP threads would otherwise spin on the cores that the rasterizer needs. Read when torch is loaded, which
     # is why commands import it only when they run.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s", stream=sys.stderr)
+    shown = logging.StreamHandler(sys.stderr)
+    shown.setFormatter(_Lines())
+    logging.basicConfig(level=logging.INFO, handlers=[shown])
     for name in ("lerobot", "httpx"):
         logging.getLogger(name).setLevel(logging.WARNING)
     arguments = sys.argv[1:] if arguments is None else arguments
@@ -146,6 +148,14 @@ def run_command(main: Callable[[list[str]], int], arguments: list[str] | None = 
         sys.stderr.write("interrupted: nothing was written\n")
         code = EXIT_INTERRUPTED
     sys.exit(code)
+
+
+class _Lines(logging.Formatter):
+    """What a command says, as a line; warnings and errors are marked."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        text = super().format(record)
+        return text if record.levelno <= logging.INFO else f"{record.levelname.lower()}: {text}"
 
 
 def _split_flags(arguments: list[str], aliases: Mapping[str, str]) -> tuple[str | None, list[str], dict[str, Any]]:

@@ -35,5 +35,7 @@ def chosen_device(name: Device, *, networks: bool = False) -> torch.device:
 
 @cache
 def _say_once(problem: str) -> None:
-    level = logging.WARNING if has_cuda_device() else logging.INFO
-    logger.log(level, "fitting and rendering on the CPU: %s", problem)
+    if has_cuda_device():
+        logger.warning("fitting and rendering on the CPU: %s", problem)
+    else:
+        logger.info("fitting and rendering on the CPU (--device cuda says what a GPU would need)")

@@ -81,7 +81,8 @@ def test_two_workers_make_the_same_dataset(desk: Path, tmp_path: Path, caplog: p
     assert one == two
     _, different, failed = filecmp.cmpfiles(tmp_path / "1", tmp_path / "2", one, shallow=False)
     assert (different, failed) == ([], [])
-    assert any(record.getMessage().startswith("overlay:") for record in caplog.records)  # said by a worker
+    assert not any(record.getMessage().startswith("overlay:") for record in caplog.records)  # a stage's finding
+    assert any(record.getMessage().startswith("episode 0, ") for record in caplog.records)  # said by a worker
 
 
 PLUGIN = """
