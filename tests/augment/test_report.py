@@ -16,7 +16,7 @@ from lerobot_msdyn.augment import __main__ as augment
 from lerobot_msdyn.augment import episode as episodes
 from lerobot_msdyn.augment.report import build
 from lerobot_msdyn.augment.report.drawing import cameras_from_above
-from lerobot_msdyn.augment.report.page import LISTED, Pictures, ViewEntry, camera_lines, page
+from lerobot_msdyn.augment.report.page import ADVICE, LISTED, Pictures, ViewEntry, camera_lines, page, summary
 from lerobot_msdyn.augment.report.pictures import data_url, film, heat_map, spread, strip
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.reconstruction.account import Account, account_sentence
@@ -111,6 +111,28 @@ def test_a_dropped_view_says_why_and_a_redrawn_one_too() -> None:
     assert "episode 3: no video" in text
     pictures = Pictures("", "", 1, 1.0, None)
     assert "Sampled again, since" in page("ds", {}, [entry(rejected=["too dark"], pictures=pictures)], [])
+
+
+def scored(db: float, cause: str) -> dict[str, Any]:
+    """A view of some expected quality, whose error is of one cause."""
+    scores = SCORES | {"expected_db": db, "causes": {name: float(name == cause) for name in ADVICE}}
+    return {"view": entry().view | {"scores": scores}}
+
+
+def test_it_opens_with_what_is_good_and_what_would_make_the_rest_better() -> None:
+    assert summary([]) == "No new views."
+    assert summary([entry(**scored(25, "depth")), entry(**scored(20, "video"))]) == "2 of 2 views good."
+    some = [
+        entry(**scored(25, "video")),
+        entry(**scored(17, "depth")),
+        entry(**scored(12, "depth"), rejected=["dim"], dropped=True),
+    ]
+    assert summary(some).startswith("1 of 3 views good, 1 doubtful, 1 dropped: depth is a guess; lower --perturbation")
+    text = page("ds", {}, [dataclasses.replace(each, pictures=Pictures("", "", 1, 1.0, None)) for each in some], [])
+    assert '<article class="good">' in text
+    assert '<article class="doubtful">' in text
+    assert "doubtful: 17.0 dB expected" in text
+    assert text.index("1 of 3 views good") < text.index("<h2>")
 
 
 def test_views_that_were_not_judged_are_shown_as_such() -> None:

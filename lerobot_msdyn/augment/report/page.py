@@ -1,6 +1,7 @@
 """The page itself: one HTML file with everything in it; every text from outside is escaped."""
 
 import html
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,10 +10,14 @@ from lerobot_msdyn.augment.report.drawing import cameras_from_above
 from lerobot_msdyn.reconstruction.account import Account, account_sentence, pooled
 
 LISTED = 1000  # rows of the table, at most
+GOOD_DB = 20.0  # expected; below it a view is doubtful (docs/views.md has how often the score is right there)
 SHOWN_POSES = 8  # of a camera that moves along the episode, about
 TOLD_PX = 1.5  # of 320: a camera that drifts or is displaced by less is not named
 STYLE = """
-:root{--ink:#1c2330;--soft:#5c6675;--line:#dde2e8;--paper:#fff;--back:#f5f6f8;--new:#c2351f;--good:#1d7a46}
+:root{--ink:#1c2330;--soft:#5c6675;--line:#dde2e8;--paper:#fff;--back:#f5f6f8;--new:#c2351f;--good:#1d7a46;
+--doubtful:#8a5a00}
+@media (prefers-color-scheme:dark){:root{--ink:#e6e9ee;--soft:#9aa5b4;--line:#2c3542;--paper:#171d26;--back:#0e1319;
+--new:#ff7a63;--good:#5fce93;--doubtful:#e0aa4a}}
 *{box-sizing:border-box}
 body{margin:0;background:var(--back);color:var(--ink);font:15px/1.5 system-ui,"Segoe UI",Roboto,sans-serif}
 main{max-width:1180px;margin:0 auto;padding:24px 20px 60px}
@@ -24,7 +29,9 @@ p{margin:0 0 10px}.soft{color:var(--soft)}
 .figures b{display:block;font-size:22px;font-weight:600}
 article{background:var(--paper);border:1px solid var(--line);border-radius:8px;padding:16px;margin:0 0 18px}
 .head{display:flex;flex-wrap:wrap;gap:4px 14px;align-items:baseline;justify-content:space-between;margin-bottom:12px}
-.score{font-weight:600;color:var(--good)}.dropped .score,.why{color:var(--new)}
+.lead{font-size:18px;margin:10px 0}.score,td.good,td.doubtful,td.dropped{font-weight:600}
+.good .score,td.good{color:var(--good)}.doubtful .score,td.doubtful{color:var(--doubtful)}
+.dropped .score,td.dropped,.why{color:var(--new)}
 .grid{display:grid;grid-template-columns:2fr 1fr 1fr;gap:16px;margin-top:14px;align-items:start}
 figure{margin:0;min-width:0}figcaption{color:var(--soft);font-size:13px;margin-top:4px}
 img,svg{display:block;width:100%;height:auto;border-radius:4px}
@@ -50,6 +57,16 @@ details{margin-top:12px}summary{cursor:pointer;color:var(--soft)}
 @media (max-width:760px){main{padding:16px 12px 40px}h1{font-size:22px}.grid{grid-template-columns:1fr 1fr}
 .grid figure:first-child{grid-column:span 2}article{padding:12px}}
 """
+ADVICE_FOR = ("doubtful", "dropped")
+# Cause of most of the expected error of those views -> what to do.
+ADVICE = {
+    "video": "the scene does not match its own video; look at the masks (the command priors), or fit it for longer "
+    "(--recipe best)",
+    "geometry": "the scene's shape is doubtful; look at masks and depth (the command priors)",
+    "depth": "depth is a guess; lower --perturbation.azimuth_deg, or supply depth (a depth camera, a depth model, or "
+    "the robot's joints by --robot.name)",
+    "sampling": "the pictures are finer than can be rendered from elsewhere; nothing is wrong",
+}
 # Score -> (name, how it is written).
 NAMES = {
     "expected_db": ("expected quality", "{:.1f} dB"),
@@ -92,9 +109,23 @@ class ViewEntry:
     pictures: Pictures | None = None
 
     @property
+    def scores(self) -> dict[str, Any] | None:
+        """What the gate measured; None: it did not look."""
+        return self.view.get("scores")
+
+    @property
     def score(self) -> float:
         """Expected quality in dB; views that were not judged come last."""
         return float(self.view.get("scores", {}).get("expected_db", float("inf")))
+
+    @property
+    def verdict(self) -> str:
+        """What to think of it: good, doubtful, not judged, or dropped."""
+        if self.dropped:
+            return "dropped"
+        if self.scores is None:
+            return "not judged"
+        return "good" if self.score >= GOOD_DB else "doubtful"
 
 
 def page(
@@ -132,13 +163,28 @@ def page(
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
         f"<title>{text(title)}</title><style>{STYLE}</style></head><body><main>"
-        f'<h1>{text(title)}</h1><p class="soft">Left and above: recorded. Right and below: rendered from the new '
-        "camera. Scores are estimates: no true picture of the new views exists.</p>"
+        f'<h1>{text(title)}</h1><p class="lead">{text(summary(entries))}</p>'
+        '<p class="soft">Left and above: recorded. Right and below: rendered from the new camera. Scores are '
+        "estimates: no true picture of the new views exists.</p>"
         f'<div class="figures">{top}</div>{left_out}<h2>What moves</h2>{moves}{_cameras(entries)}{_links(links or {})}'
         f"<h2>Views</h2>{''.join(_article(entry) for entry in shown[:LISTED])}"
         f'<h2>All views</h2><div class="scroll">{_table(entries[:LISTED])}</div>{rest}'
         "</main></body></html>\n"
     )
+
+
+def summary(entries: Sequence[ViewEntry]) -> str:
+    """How many views are good, and what would make the others better."""
+    if not entries:
+        return "No new views."
+    count = Counter(entry.verdict for entry in entries)
+    said = [f"{number} {name}" for name, number in count.items() if name != "good"]
+    opening = f"{count['good']} of {len(entries)} views good{''.join(f', {part}' for part in said)}"
+    doubtful = [entry.scores["causes"] for entry in entries if entry.verdict in ADVICE_FOR and entry.scores]
+    if not doubtful:
+        return f"{opening}."
+    cause = max(ADVICE, key=lambda name: sum(causes.get(name, 0.0) for causes in doubtful))
+    return f"{opening}: {ADVICE[cause]}."
 
 
 def accounts_of(entries: Iterable[ViewEntry]) -> dict[str, Account]:
@@ -195,15 +241,14 @@ def bullets(lines: Iterable[str]) -> str:
 
 
 def _article(entry: ViewEntry) -> str:
-    verdict = "dropped" if entry.dropped else "kept"
-    scores = entry.view.get("scores")
-    score = f"{scores['expected_db']:.1f} dB expected, {verdict}" if scores else verdict
+    scores = entry.scores
+    score = f"{entry.verdict}: {scores['expected_db']:.1f} dB expected" if scores else entry.verdict
     why = ""
     if entry.rejected:
         name = "Why it was dropped" if entry.dropped else "Sampled again, since"
         why = f'<p class="why">{name}:</p>{bullets(dict.fromkeys(entry.rejected))}'
     return (
-        f'<article class="{verdict}"><div class="head"><h3>Episode {entry.episode}, variant {entry.variant}, '
+        f'<article class="{entry.verdict}"><div class="head"><h3>Episode {entry.episode}, variant {entry.variant}, '
         f'{text(entry.camera)}</h3><span class="score">{text(score)}</span></div>{_pictures(entry)}'
         f"{_scores(scores) if scores else ''}{why}{_frames(scores['frames']) if scores else ''}</article>"
     )
@@ -273,15 +318,15 @@ def _table(entries: Sequence[ViewEntry]) -> str:
     )
     rows = []
     for entry in entries:
-        scores = entry.view.get("scores")
+        scores = entry.scores
         values = (f"{scores['expected_db']:.1f} dB", f"{scores['unseen']:.1%}") if scores else ("not judged", "")
-        verdict = f"dropped: {entry.rejected[-1]}" if entry.dropped else "kept"
+        verdict = f"dropped: {entry.rejected[-1]}" if entry.dropped else entry.verdict
         resampled = len(entry.rejected) - int(entry.dropped)
         moves = "".join(f"<td>{cell}</td>" for cell in _account_cells(entry.view["what_moves"]))
         rows.append(
             f"<tr><td>{entry.episode}</td><td>{entry.variant}</td><td>{text(entry.camera)}</td>"
             f"<td>{entry.view.get('camera', {}).get('drift_px', '')}</td><td>{values[0]}</td>"
-            f'<td>{values[1]}</td>{moves}<td>{resampled}</td><td class="text">{text(verdict)}</td></tr>'
+            f'<td>{values[1]}</td>{moves}<td>{resampled}</td><td class="text {entry.verdict}">{text(verdict)}</td></tr>'
         )
     return f"<table>{head}{''.join(rows)}</table>"
 
