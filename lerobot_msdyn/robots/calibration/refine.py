@@ -11,7 +11,8 @@ from lerobot_msdyn.robots.calibration.search import Pose
 from lerobot_msdyn.robots.description import Robot
 
 KNOWN = 0.99
-MOST_POINTS = 9000  # of all outlines, in one step
+LEAST_POINTS, MOST_POINTS = 50, 9000  # of all outlines, in one step
+DRAWN = 2  # rounds for which outlines that were drawn serve
 
 
 @dataclass(frozen=True)
@@ -96,23 +97,31 @@ def refined(
     scale_px: tuple[float, float],
     joints: bool = True,
 ) -> Solution:
-    """A solution after some rounds; the outlines are drawn anew in each."""
-    solution = start
+    """A solution after some rounds; the outlines are drawn anew in every other."""
+    solution, points = start, None
     for number in range(rounds):
         share = number / max(rounds - 1, 1)
         width = scale_px[0] * (scale_px[1] / scale_px[0]) ** share
-        solution = _step(problem, solution, frames, width, joints)
+        posed = Posed(problem.robot, solution.values(problem.values[frames], problem.rate[frames]))
+        if points is None or number % DRAWN == 0:
+            points = posed.outline(solution.pose, problem.size, problem.moving).thinned(MOST_POINTS)
+        else:
+            points = posed.moved(points, solution.pose, problem.size)
+        if len(points) < LEAST_POINTS:
+            return solution
+        solution = _step(problem, solution, frames, posed, points, width, joints)
     return solution
 
 
 def _step(
-    problem: Problem, solution: Solution, frames: Int64[ndarray, " k"], scale_px: float, joints: bool
+    problem: Problem,
+    solution: Solution,
+    frames: Int64[ndarray, " k"],
+    posed: Posed,
+    points: Outline,
+    scale_px: float,
+    joints: bool,
 ) -> Solution:
-    values = solution.values(problem.values[frames], problem.rate[frames])
-    posed = Posed(problem.robot, values)
-    points = posed.outline(solution.pose, problem.size, problem.moving).thinned(MOST_POINTS)
-    if len(points) < 50:
-        return solution
     value, slope, known = problem.observed(frames, points)
     by_pose, by_joints = jacobian(posed, solution.pose, points, problem.size[0])
     steep = np.einsum("ni,nij->nj", slope, by_pose)

@@ -22,9 +22,9 @@ logger = logging.getLogger(__name__)
 FEW = 28  # frames in which the camera is looked for by masks
 SHORT_FRAMES, SHORT_ROUNDS, SHORT_PX = 14, 8, (8.0, 3.0)  # of each candidate; loss in px of 320
 CANDIDATES = 3
-MASK_ROUNDS, MASK_PX = 7, (4.0, 1.5)
-EDGE_ROUNDS, EDGE_PX = 12, (2.0, 0.7)
-LAST_ROUNDS = 5  # with all frames
+MASK_ROUNDS, MASK_PX = 6, (4.0, 1.5)
+EDGE_ROUNDS, EDGE_PX = 10, (2.0, 0.7)
+LAST_ROUNDS = 4  # with all frames
 GROWN = 4  # px of 320 by which the robot is taken larger where the empty scene is looked for
 GOOD_HITS = 0.75  # below this, larger errors of the joints are looked for
 WIDE = Spread(offset_deg=4.0, scale=0.06)
