@@ -27,7 +27,7 @@ EDGE_ROUNDS, EDGE_PX = 10, (2.0, 0.7)
 LAST_ROUNDS = 4  # with all frames
 GROWN = 4  # px of 320 by which the robot is taken larger where the empty scene is looked for
 GOOD_HITS = 0.75  # below this, larger errors of the joints are looked for
-WIDE = Spread(offset_deg=4.0, scale=0.06)
+WIDE, WIDER_PX = Spread(offset_deg=4.0, scale=0.06, noise_deg=1.0), 2.0
 LEAST_GAIN = 0.015  # of the share of hits, by which corrected joints must fit better
 LEAST_HITS = 0.6  # share of the outlines that lie on edges
 LEAST_MARGIN = 0.04  # by which another camera must fit worse
@@ -126,7 +126,8 @@ def _slid(
     joints: bool,
 ) -> tuple[Problem, Solution, Solution]:
     """Onto masks of what moves, then onto those of the robot, then onto edges; without and with corrected joints."""
-    every, px = np.arange(len(few)), _px(MASK_PX, coarse)
+    wider = WIDER_PX if spread is WIDE else 1.0
+    every, px = np.arange(len(few)), _px(MASK_PX, coarse, wider)
     problem = Problem(coarse.robot, coarse.values, coarse.rate, coarse.distance, spread)
     solution = refined(problem, solution, every, MASK_ROUNDS, px, joints)
     problem = problem.with_masks(*pictures.masks(_about(problem, solution), few))
@@ -134,7 +135,7 @@ def _slid(
     none = np.zeros((len(values), *coarse.distance.shape[1:]), np.float32)
     problem = Problem(coarse.robot, values, rate, none, spread)
     problem = problem.with_difference(*pictures.difference(_about(problem, solution)))
-    px = _px(EDGE_PX, coarse)
+    px = _px(EDGE_PX, coarse, wider)
     solution = refined(problem, solution, used[: len(few)], EDGE_ROUNDS, px, joints)
     solution = refined(problem, solution, used, LAST_ROUNDS, (px[1], px[1]), joints)
     corrected = refined(problem, solution, used, LAST_ROUNDS, (px[1], px[1]), joints=True)
@@ -158,9 +159,9 @@ def _about(problem: Problem, solution: Solution) -> Bool[ndarray, "t h w"]:
     return np.stack([cv2.dilate((link >= 0).astype(np.uint8), kernel, iterations=grown) for link in links]) > 0
 
 
-def _px(scale: tuple[float, float], problem: Problem) -> tuple[float, float]:
+def _px(scale: tuple[float, float], problem: Problem, times: float = 1.0) -> tuple[float, float]:
     """Pixels of the pictures, of those of pictures 320 wide."""
-    factor = problem.size[0] / 320
+    factor = times * problem.size[0] / 320
     return scale[0] * factor, scale[1] * factor
 
 
