@@ -30,7 +30,8 @@ from lerobot_msdyn.priors.masks.robot import RobotPictures
 from lerobot_msdyn.robots import Robot, load_robot, map_joints
 from lerobot_msdyn.robots.calibration.contours import Posed
 from lerobot_msdyn.robots.calibration.search import Pose, angle_between
-from lerobot_msdyn.robots.calibration.solve import GOOD_HITS, Solution, Verdict, solve
+from lerobot_msdyn.robots.calibration.solve import Solution, Verdict, solve
+from lerobot_msdyn.robots.calibration.units import fit, is_settled
 from lerobot_msdyn.robots.mapping import in_units
 
 CASES = ("random", "spin", "disturbed")
@@ -136,12 +137,13 @@ def solved(case: Case, worse: bool, seed: int) -> tuple[Verdict, np.ndarray]:
     shown = WorseMasks(case.frames, seed) if worse else RobotPictures(case.frames)
     mapping = map_joints(case.robot, NAMES, case.state)
     tried = []
-    for each in (mapping, in_units(case.robot, mapping, "normalised")):
+    mappings = (mapping, in_units(case.robot, mapping, "normalised"))
+    for each in mappings:
         values = each.values(case.state)
         rate = np.gradient(values, 1 / FPS, axis=0)
         verdict = solve(case.robot, values, rate, shown)
-        tried.append((verdict.hits, verdict, verdict.solution.values(values, rate)))
-        if verdict.hits >= GOOD_HITS:
+        tried.append((fit(verdict), verdict, verdict.solution.values(values, rate)))
+        if is_settled(each, verdict, mappings):
             break
     _, verdict, joints = max(tried, key=lambda item: item[0])
     return verdict, joints

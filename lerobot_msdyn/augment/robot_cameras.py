@@ -31,7 +31,8 @@ from lerobot_msdyn.robots import JointMap, Robot, find_description, load_robot, 
 from lerobot_msdyn.robots.calibration.frames import spread_frames, surface
 from lerobot_msdyn.robots.calibration.picture import links_over
 from lerobot_msdyn.robots.calibration.record import RobotRecord
-from lerobot_msdyn.robots.calibration.solve import GOOD_HITS, Verdict, solve
+from lerobot_msdyn.robots.calibration.solve import Verdict, solve
+from lerobot_msdyn.robots.calibration.units import fit, is_settled
 from lerobot_msdyn.robots.mapping import in_units
 
 logger = logging.getLogger(__name__)
@@ -215,15 +216,16 @@ def robot_cameras(
     if longest < MIN_FRAMES:
         raise DatasetError(f"{source.repo_id}: {longest} frames; expected at least {MIN_FRAMES}: add episodes")
     tried = []
-    for each in _mappings(robot, mapping, states, config):
+    mappings = _mappings(robot, mapping, states, config)
+    for each in mappings:
         solved = {
             key: [_solved(robot, each, one, states, source.fps) for one in group] for key, group in places.items()
         }
-        share = max(one.verdict.hits for group in solved.values() for one in group if one.verdict is not None)
-        tried.append((share, RobotCameras(robot, each, list(episodes), solved)))
-        if share >= GOOD_HITS:
+        best = max((one.verdict for group in solved.values() for one in group if one.verdict is not None), key=fit)
+        tried.append((fit(best), RobotCameras(robot, each, list(episodes), solved)))
+        if is_settled(each, best, mappings):
             break
-        logger.info("joints in %s: %.0f %% of the outlines lie on edges", each.units, 100 * share)
+        logger.info("joints in %s: %.0f %% of the outlines lie on edges", each.units, 100 * best.hits)
     return max(tried, key=lambda item: item[0])[1]
 
 

@@ -22,7 +22,7 @@ class Spread:
     offset_deg: float = 1.5  # of each joint's zero
     scale: float = 0.02  # of each joint's unit, relative
     lag_s: float = 0.03  # of the state behind the video
-    noise_deg: float = 0.3  # of each joint in each frame
+    noise_deg: float = 0.1  # of each joint in each frame
     grown_px: float = 0.5  # by which masks are larger than what they show
     log_focal: float = 0.4
 
