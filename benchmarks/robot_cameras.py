@@ -100,7 +100,9 @@ def made(case: str, seed: int, folder: Path) -> Case:
 
 def _recorded_badly(robot: Robot, state: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """In -100..100 of ranges that are not quite those of the description, noisy, and one frame ahead."""
-    middles, spans = np.array([(np.degrees(j.lower + j.upper) / 2, np.degrees(j.upper - j.lower)) for j in _turning(robot)]).T
+    middles, spans = np.array(
+        [(np.degrees(j.lower + j.upper) / 2, np.degrees(j.upper - j.lower)) for j in _turning(robot)]
+    ).T
     middles = middles + 3 * rng.choice([-1, 1], len(middles))
     spans = spans * (1 + 0.03 * rng.choice([-1, 1], len(spans)))
     out = np.concatenate([state[1:], state[-1:]])
@@ -224,16 +226,19 @@ def summary(rows: list[dict[str, Any]]) -> str:
     """Shares and medians."""
     wrong = [row for row in rows if row["wrong"]]
     believed = [row for row in rows if not row["doubt"]]
+    doubted = [row for row in rows if row["doubt"]]
     text = (
         f"{len(rows)} cameras: {len(believed)} believed, of which {sum(row['wrong'] for row in believed)} are wrong; "
-        f"{len(rows) - len(believed)} doubted, of which {sum(not row['wrong'] for row in rows if row['doubt'])} are right; "
+        f"{len(doubted)} doubted, of which {sum(not row['wrong'] for row in doubted)} are right; "
         f"{len(wrong)} wrong in all; {np.mean([row['cpu_s'] for row in rows]):.1f} CPU s each"
     )
     if not believed:
         return text
     names = ("turned_deg", "apart", "focal", "depth")
     values = np.array([[abs(row[name]) for name in names] for row in believed])
-    for share, turned, apart, focal, depth in zip((50, 90, 99), *np.percentile(values, (50, 90, 99), axis=0).T, strict=True):
+    for share, turned, apart, focal, depth in zip(
+        (50, 90, 99), *np.percentile(values, (50, 90, 99), axis=0).T, strict=True
+    ):
         text += f"\nbelieved, {share} %: {turned:.2f} deg, {apart:.2%}, focal {focal:.2%}, arm's depth {depth:.2%}"
     return text
 

@@ -36,8 +36,8 @@ def draw_triangles(
     depth: Float32[ndarray, "h w"],
     index: Int32[ndarray, "h w"],
 ) -> None:
-    """Z-buffer of triangles of `project_vertices`: where they are nearer than `depth` (m), it and `index` (the face) are
-    replaced. Triangles that reach behind 1 cm are left out.
+    """Z-buffer of triangles of `project_vertices`: where they are nearer than `depth` (m), it and `index` (the face)
+    are replaced. Triangles that reach behind 1 cm are left out.
     """
     height, width = depth.shape
     for face in range(faces.shape[0]):

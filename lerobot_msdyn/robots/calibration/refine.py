@@ -184,7 +184,9 @@ def _step(
     eliminated = np.linalg.solve(own, np.concatenate([shared, slope[..., None]], axis=2))
     weighted = (design * seen.weight[:, None]).T
     normal = weighted @ design - np.einsum("kjp,kjq->pq", shared, eliminated[..., :-1]) + np.diag(strength**2)
-    right = -(weighted @ seen.residual) + np.einsum("kjp,kj->p", shared, eliminated[..., -1]) - strength**2 * np.array(at)
+    right = (
+        -(weighted @ seen.residual) + np.einsum("kjp,kj->p", shared, eliminated[..., -1]) - strength**2 * np.array(at)
+    )
     step = np.linalg.solve(normal + np.diag(1e-9 * np.diag(normal) + 1e-12), right)
     covariance = np.linalg.inv(normal + 1e-9 * np.eye(len(normal)) * np.diag(normal).max() * 1e-6)[:7, :7]
     noise = noise - eliminated[..., -1] - eliminated[..., :-1] @ step

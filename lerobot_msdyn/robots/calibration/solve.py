@@ -3,7 +3,7 @@
 import logging
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import cv2
@@ -80,9 +80,7 @@ def solve(robot: Robot, values: Float64[ndarray, "t j"], rate: Float64[ndarray, 
     """
     start = time.perf_counter()
     points = surface(robot, values)
-    order = spread_frames(points, len(points))
-    held = order[3::4]
-    used = np.array([frame for frame in order if frame not in set(held.tolist())])
+    used, held = _split(points)
     few = used[:FEW]
     masks = pictures.moving(few)
     coarse = Problem(robot, values[few], rate[few], signed_distance(masks), Spread())
@@ -93,6 +91,46 @@ def solve(robot: Robot, values: Float64[ndarray, "t j"], rate: Float64[ndarray, 
         verdict = max(verdict, other, key=lambda each: each[1])
     solution, share = verdict
     return Verdict(solution, share, margin, _doubt(solution, share, margin), time.perf_counter() - start)
+
+
+def with_joints(
+    verdict: Verdict,
+    other: Solution,
+    robot: Robot,
+    values: Float64[ndarray, "t j"],
+    rate: Float64[ndarray, "t j"],
+    pictures: Pictures,
+) -> Verdict:
+    """A camera again, with the joints as another camera of the same robot corrected them: both then share one world.
+
+    Args:
+        verdict: the camera that was found by itself.
+        other: the other one.
+        robot: as for `solve`, and all that follows.
+        values: of its joints in the frames of this camera.
+        rate: their change per second.
+        pictures: what these frames show.
+    """
+    start = time.perf_counter()
+    used, held = _split(surface(robot, values))
+    few = used[:FEW]
+    first = replace(other, pose=verdict.solution.pose, grown_px=0.0)
+    coarse = Problem(robot, values[few], rate[few], signed_distance(pictures.moving(few)), Spread())
+    tried: list[tuple[Solution, float]] = []
+    for spread in (Spread(), WIDE):
+        problem, solution, _ = _slid(coarse, first, values, rate, pictures, few, used, spread, False)
+        tried.append((solution, hits(problem, solution, held)))
+        if tried[-1][1] >= GOOD_HITS:
+            break
+    solution, share = max(tried, key=lambda each: each[1])
+    seconds = verdict.seconds + time.perf_counter() - start
+    return Verdict(solution, share, verdict.margin, _doubt(solution, share, verdict.margin), seconds)
+
+
+def _split(points: Float32[ndarray, "t n 3"]) -> tuple[Int64[ndarray, " u"], Int64[ndarray, " k"]]:
+    """Frames by how differently the robot stands in them: those that are used, and every fourth, which is held out."""
+    order = spread_frames(points, len(points))
+    return np.delete(order, np.s_[3::4]), order[3::4]
 
 
 def _chosen(coarse: Problem, found: list[Candidate]) -> tuple[Solution, float]:
