@@ -202,7 +202,7 @@ def _noise(
     problem: Problem, solution: Solution, frames: Int64[ndarray, " k"], scale_px: tuple[float, float], rounds: int = 3
 ) -> Float64[ndarray, "k j"]:
     """What the joints are off by in single frames; all else is kept."""
-    noise = np.zeros((len(frames), len(problem.robot.movable)))
+    noise: Float64[ndarray, "k j"] = np.zeros((len(frames), len(problem.robot.movable)))
     values = solution.values(problem.values[frames], problem.rate[frames])
     points = Posed(problem.robot, values).outline(solution.pose, problem.size, problem.moving)
     for number in range(rounds if len(points) else 0):
