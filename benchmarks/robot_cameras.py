@@ -4,9 +4,9 @@ python benchmarks/robot_cameras.py --case random --count 100 --results cameras.j
 
 Cases: `random` (any arm, any view, something else turns and moves; the first joint rests in a third of them), `spin`
 (two joints rest, and a large disc turns), `disturbed` (the state in -100..100 of ranges that are off by 3 degrees and
-3 %, with noise of 1 degree, one frame ahead of the video; masks worse by patches, blobs and holes; a turn about the first joint's
-axis, whose zero cannot be told, is no error). A camera is wrong if it is further off than 0.5 degree, or 1.5 % of its
-distance, and three standard deviations that it states. A results file is gone on with.
+3 %, with noise of 1 degree, one frame ahead of the video; masks worse by patches, blobs and holes; a turn about the
+first joint's axis, whose zero cannot be told, is no error). A camera is wrong if it is further off than 0.5 degree, or
+1.5 % of its distance, and three standard deviations that it states. A results file is gone on with.
 """
 
 import argparse
