@@ -31,7 +31,9 @@ from lerobot_msdyn.robots import JointMap, Robot, find_description, load_robot, 
 from lerobot_msdyn.robots.calibration.frames import spread_frames, surface
 from lerobot_msdyn.robots.calibration.picture import links_over
 from lerobot_msdyn.robots.calibration.record import RobotRecord
-from lerobot_msdyn.robots.calibration.solve import GOOD_HITS, Verdict, solve
+from lerobot_msdyn.robots.calibration.refine import Solution
+from lerobot_msdyn.robots.calibration.solve import Verdict, solve, with_joints
+from lerobot_msdyn.robots.calibration.units import fit, is_settled
 from lerobot_msdyn.robots.mapping import in_units
 
 logger = logging.getLogger(__name__)
@@ -115,7 +117,7 @@ class RobotCameras:
         }
 
     def _record(self) -> dict[str, Any]:
-        """The robot, with the joints as the camera with the most hits corrected them."""
+        """The robot, with the joints as its cameras corrected them: all alike (`_in_one_world`)."""
         solution = max(self.believed, key=lambda verdict: verdict.hits).solution
         scale, offset = self.mapping.scale * solution.scale, self.mapping.offset * solution.scale + solution.offset
         corrected = replace(self.mapping, scale=scale, offset=offset)
@@ -215,16 +217,40 @@ def robot_cameras(
     if longest < MIN_FRAMES:
         raise DatasetError(f"{source.repo_id}: {longest} frames; expected at least {MIN_FRAMES}: add episodes")
     tried = []
-    for each in _mappings(robot, mapping, states, config):
+    mappings = _mappings(robot, mapping, states, config)
+    for each in mappings:
         solved = {
             key: [_solved(robot, each, one, states, source.fps) for one in group] for key, group in places.items()
         }
-        share = max(one.verdict.hits for group in solved.values() for one in group if one.verdict is not None)
-        tried.append((share, RobotCameras(robot, each, list(episodes), solved)))
-        if share >= GOOD_HITS:
+        best = max((one.verdict for group in solved.values() for one in group if one.verdict is not None), key=fit)
+        tried.append((fit(best), RobotCameras(robot, each, list(episodes), solved)))
+        if is_settled(each, best, mappings):
             break
-        logger.info("joints in %s: %.0f %% of the outlines lie on edges", each.units, 100 * share)
-    return max(tried, key=lambda item: item[0])[1]
+        logger.info("joints in %s: %.0f %% of the outlines lie on edges", each.units, 100 * best.hits)
+    return _in_one_world(max(tried, key=lambda item: item[0])[1], states, source.fps)
+
+
+def _in_one_world(found: RobotCameras, states: States, fps: int | float) -> RobotCameras:
+    """The joints as the camera with the most hits corrected them, for all cameras that are believed."""
+    if len(found.believed) < 2:
+        return found
+    best = max(found.believed, key=lambda verdict: verdict.hits).solution
+
+    def again(place: Place) -> Place:
+        verdict = place.verdict
+        if verdict is None or not verdict.confident or _same_joints(verdict.solution, best):
+            return place
+        values, rates = joints_in(place.frames, found.mapping, states, fps)
+        verdict = with_joints(verdict, best, found.robot, values, rates, RobotPictures(place.pictures))
+        return replace(place, verdict=verdict, joints=verdict.solution.values(values, rates))
+
+    return replace(found, places={key: [again(place) for place in places] for key, places in found.places.items()})
+
+
+def _same_joints(one: Solution, other: Solution) -> bool:
+    return one.lag_s == other.lag_s and all(
+        np.array_equal(getattr(one, name), getattr(other, name)) for name in ("offset", "scale")
+    )
 
 
 def places_of(source: LeRobotDatasetMetadata, key: str, episodes: Sequence[int]) -> list[list[int]]:

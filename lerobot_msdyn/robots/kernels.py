@@ -8,61 +8,64 @@ from lerobot_msdyn.core.compiled import compiled
 
 
 @compiled
-def draw_triangles(
-    points: Float64[ndarray, "v 3"],
-    faces: Int32[ndarray, "f 3"],
+def project_vertices(
+    vertices: Float32[ndarray, "v 3"],
+    link: Int32[ndarray, " v"],
+    camera_from_link: Float64[ndarray, "l 4 4"],
     focal: float,
     cx: float,
     cy: float,
+    out: Float64[ndarray, "v 3"],
+) -> None:
+    """Where vertices are in the picture (px; pixel centres are whole numbers), and 1/z (1/m); 0 if nearer than 1 cm."""
+    for v in range(vertices.shape[0]):
+        pose, x, y, z = camera_from_link[link[v]], vertices[v, 0], vertices[v, 1], vertices[v, 2]
+        depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
+        if depth < 0.01:
+            out[v] = 0.0
+            continue
+        out[v, 0] = focal * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) / depth + cx - 0.5
+        out[v, 1] = focal * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) / depth + cy - 0.5
+        out[v, 2] = 1.0 / depth
+
+
+@compiled
+def draw_triangles(
+    points: Float64[ndarray, "v 3"],
+    faces: Int32[ndarray, "f 3"],
     depth: Float32[ndarray, "h w"],
     index: Int32[ndarray, "h w"],
 ) -> None:
-    """Z-buffer of triangles given in the camera's frame: where they are nearer than `depth`, it and `index` (the face)
+    """Z-buffer of triangles of `project_vertices`: where they are nearer than `depth` (m), it and `index` (the face)
     are replaced. Triangles that reach behind 1 cm are left out.
     """
     height, width = depth.shape
     for face in range(faces.shape[0]):
         a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
-        za, zb, zc = points[a, 2], points[b, 2], points[c, 2]
-        if za < 0.01 or zb < 0.01 or zc < 0.01:
+        xa, xb, xc = points[a, 0], points[b, 0], points[c, 0]
+        x0, x1 = max(0, int(np.ceil(min(xa, xb, xc)))), min(width - 1, int(np.floor(max(xa, xb, xc))))
+        if x0 > x1:
             continue
-        xa, ya = focal * points[a, 0] / za + cx - 0.5, focal * points[a, 1] / za + cy - 0.5
-        xb, yb = focal * points[b, 0] / zb + cx - 0.5, focal * points[b, 1] / zb + cy - 0.5
-        xc, yc = focal * points[c, 0] / zc + cx - 0.5, focal * points[c, 1] / zc + cy - 0.5
+        ya, yb, yc = points[a, 1], points[b, 1], points[c, 1]
+        y0, y1 = max(0, int(np.ceil(min(ya, yb, yc)))), min(height - 1, int(np.floor(max(ya, yb, yc))))
+        if y0 > y1:
+            continue
+        na, nb, nc = points[a, 2], points[b, 2], points[c, 2]
         area = (xb - xa) * (yc - ya) - (xc - xa) * (yb - ya)
-        if area == 0.0:
+        if area == 0.0 or na == 0.0 or nb == 0.0 or nc == 0.0:
             continue
-        left, right = min(xa, xb, xc), max(xa, xb, xc)
-        top, bottom = min(ya, yb, yc), max(ya, yb, yc)
-        if right < 0 or bottom < 0 or left > width - 1 or top > height - 1:
-            continue
-        x0, x1 = max(0, int(np.ceil(left))), min(width - 1, int(np.floor(right)))
-        y0, y1 = max(0, int(np.ceil(top))), min(height - 1, int(np.floor(bottom)))
+        inverse = 1.0 / area
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
-                wa = ((xb - x) * (yc - y) - (xc - x) * (yb - y)) / area
-                wb = ((xc - x) * (ya - y) - (xa - x) * (yc - y)) / area
+                wa = ((xb - x) * (yc - y) - (xc - x) * (yb - y)) * inverse
+                wb = ((xc - x) * (ya - y) - (xa - x) * (yc - y)) * inverse
                 wc = 1.0 - wa - wb
                 if wa < 0 or wb < 0 or wc < 0:
                     continue
-                z = 1.0 / (wa / za + wb / zb + wc / zc)
+                z = 1.0 / (wa * na + wb * nb + wc * nc)
                 if z < depth[y, x]:
                     depth[y, x] = z
                     index[y, x] = face
-
-
-@compiled
-def place_vertices(
-    vertices: Float32[ndarray, "v 3"],
-    link: Int32[ndarray, " v"],
-    camera_from_link: Float64[ndarray, "l 4 4"],
-    out: Float64[ndarray, "v 3"],
-) -> None:
-    """Vertices in the camera's frame, m."""
-    for v in range(vertices.shape[0]):
-        pose, x, y, z = camera_from_link[link[v]], vertices[v, 0], vertices[v, 1], vertices[v, 2]
-        for k in range(3):
-            out[v, k] = pose[k, 0] * x + pose[k, 1] * y + pose[k, 2] * z + pose[k, 3]
 
 
 @compiled

@@ -1,6 +1,6 @@
 """The camera of arms that no one has built, from masks of what moves and their joints."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -14,7 +14,9 @@ from lerobot_msdyn.robots.calibration.contours import Posed, jacobian, sampled, 
 from lerobot_msdyn.robots.calibration.frames import spread_frames, surface
 from lerobot_msdyn.robots.calibration.refine import Problem, Solution, Spread, hits, refined
 from lerobot_msdyn.robots.calibration.search import Pose, angle_between
-from lerobot_msdyn.robots.calibration.solve import solve
+from lerobot_msdyn.robots.calibration.solve import Verdict, solve, with_joints
+from lerobot_msdyn.robots.calibration.units import fit, is_settled
+from lerobot_msdyn.robots.mapping import in_units
 
 FRAMES = 40
 
@@ -89,6 +91,21 @@ def test_distances_are_those_to_the_edge_between_pixels() -> None:
     assert slope == pytest.approx(np.array([[1, 0], [-1, 0]]), abs=1e-6)
 
 
+def test_points_of_an_outline_follow_links_and_camera(front: Filmed) -> None:
+    still, size = Posed(front.robot, front.values[:2]), (WIDTH, HEIGHT)
+    drawn = still.outline(front.pose, size, np.asarray(front.robot.moved_by.any(1)))
+    assert still.moved(drawn, front.pose, size).xy == pytest.approx(drawn.xy, abs=1e-3)
+    later, pose = Posed(front.robot, front.values[:2] + 0.02), nearby(front.pose, 0.02)
+    moved = later.moved(drawn, pose, size)
+    by_hand = later.links @ np.linalg.inv(still.links)
+    ahead = by_hand[drawn.frame, drawn.link]
+    point = np.einsum("nij,nj->ni", ahead[:, :3, :3], drawn.point) + ahead[:, :3, 3]
+    assert moved.point == pytest.approx(point, abs=1e-9)
+    seen = point @ pose.rotation.T + pose.translation
+    column = pose.focal * WIDTH * seen[:, 0] / seen[:, 2] + WIDTH / 2
+    assert moved.xy[:, 0] == pytest.approx(column, abs=1e-6)
+
+
 def test_outlines_slide_onto_the_masks(front: Filmed) -> None:
     problem = Problem(front.robot, front.values, 0 * front.values, signed_distance(front.masks), Spread())
     start = front.solution(nearby(front.pose))
@@ -117,6 +134,44 @@ def test_a_late_video_is_told(front: Filmed) -> None:
     assert solution.lag_s == pytest.approx(-1 / 30, abs=0.01)
 
 
+def test_joints_that_are_noisy_do_not_bend_the_camera(front: Filmed) -> None:
+    rng = np.random.default_rng(1)
+    noisy = front.values + np.radians(rng.normal(0, 1, front.values.shape)) * (np.arange(6) < 5)
+    off = {}
+    for noise_deg in (0.01, 1.0):
+        spread = Spread(noise_deg=noise_deg)
+        problem = Problem(front.robot, noisy, 0 * noisy, signed_distance(front.masks), spread)
+        frames = np.arange(FRAMES)
+        solution = refined(problem, front.solution(nearby(front.pose, 0.02)), frames, 16, (3.0, 0.7), joints=False)
+        off[noise_deg] = front.off(solution.pose), hits(problem, solution, frames)
+    (turned, apart, focal), share = off[1.0]
+    assert share > 0.95 > 0.85 > off[0.01][1]
+    assert turned < 0.75 * off[0.01][0][0]
+    assert apart < 1
+    assert focal < 1
+
+
+def test_the_unit_of_the_first_joint_is_found_and_its_zero_is_kept(front: Filmed) -> None:
+    wrong = front.values.copy()
+    wrong[:, 0] = 1.05 * wrong[:, 0]
+    problem = Problem(front.robot, wrong, 0 * wrong, signed_distance(front.masks), Spread(scale=0.06))
+    assert problem.zero_is_free.tolist() == [False, True, True, True, True, True]
+    solution = refined(problem, front.solution(nearby(front.pose, 0.02)), np.arange(0, FRAMES, 2), 16, (4.0, 1.0))
+    assert solution.scale[0] == pytest.approx(1 / 1.05, abs=0.015)
+
+
+@pytest.mark.parametrize(("scale", "hit", "settled"), [(1.0, 0.9, True), (1.0, 0.7, False), (1.08, 0.9, False)])
+def test_units_are_settled_where_hardly_anything_was_corrected(
+    front: Filmed, scale: float, hit: float, settled: bool
+) -> None:
+    degrees = map_joints(front.robot, NAMES, swing(FRAMES))
+    shares = in_units(front.robot, degrees, "normalised")  # 9 % larger
+    solution = replace(front.solution(front.pose), scale=np.full(6, scale))
+    verdict = Verdict(solution, hit, 0.3, "", 0.0)
+    assert is_settled(degrees, verdict, [degrees, shares]) is settled
+    assert fit(verdict) == pytest.approx(hit - 0.5 * (scale - 1))
+
+
 class OnlyMasks:
     """Pictures of which nothing but masks is known."""
 
@@ -131,6 +186,22 @@ class OnlyMasks:
 
     def difference(self, robot: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return 50 * self._masks.astype(np.float32), np.ones(robot.shape[1:], bool)
+
+
+def test_another_camera_takes_the_joints_of_the_first(front: Filmed) -> None:
+    side = filmed(front.robot, camera(20, 40, 0.8, 55), swing(FRAMES))
+    wrong = front.values - np.radians([0, 4, -4, 4, 0, 0])
+    first = Solution(front.pose, np.radians([0, 4, -4, 4, 0, 0.0]), np.ones(6))
+    second = replace(first, pose=nearby(side.pose, 0.02), offset=np.zeros(6))
+    verdict = Verdict(second, 0.5, 0.3, "only half", 1.0)
+    found = with_joints(verdict, first, front.robot, wrong, 0 * wrong, OnlyMasks(side.masks))
+    assert found.solution.offset == pytest.approx(first.offset)
+    assert found.confident, found.doubt
+    assert found.hits > 0.9
+    turned, apart, focal = side.off(found.solution.pose)
+    assert turned < 0.3
+    assert apart < 1
+    assert focal < 1
 
 
 @pytest.mark.slow

@@ -1,6 +1,8 @@
 """Outlines of the links as a camera sees them, and how they move with the camera and the joints."""
 
-from dataclasses import dataclass
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -10,7 +12,7 @@ from numpy import ndarray
 
 from lerobot_msdyn.robots.calibration.search import Pose
 from lerobot_msdyn.robots.description import Robot
-from lerobot_msdyn.robots.kernels import draw_triangles, place_vertices, trace_edges
+from lerobot_msdyn.robots.kernels import draw_triangles, project_vertices, trace_edges
 from lerobot_msdyn.robots.kinematics import link_poses
 
 FAR = np.float32(1e6)
@@ -27,6 +29,7 @@ class Outline:
     frame: Int64[ndarray, " n"]
     xy: Float64[ndarray, "n 2"]  # px
     point: Float64[ndarray, "n 3"]  # m, in the robot's frame
+    on_link: Float64[ndarray, "n 3"]  # m, in the link's
     link: Int32[ndarray, " n"]
     normal: Float64[ndarray, "n 2"]  # unit vectors in the picture, away from the robot
 
@@ -36,7 +39,7 @@ class Outline:
     def thinned(self, count: int) -> "Outline":
         """At most so many of the points."""
         step = -(-len(self) // count) if len(self) else 1
-        return Outline(*(getattr(self, name)[::step] for name in ("frame", "xy", "point", "link", "normal")))
+        return Outline(*(getattr(self, name)[::step] for name in ("frame", "xy", "point", "on_link", "link", "normal")))
 
 
 class Posed:
@@ -79,8 +82,9 @@ class Posed:
         camera_from_robot = np.eye(4)
         camera_from_robot[:3, :3], camera_from_robot[:3, 3] = pose.rotation, pose.translation
         points = np.empty((len(self.robot.vertices), 3))
-        place_vertices(self.robot.vertices, self._vertex_link, camera_from_robot @ self.links[frame], points)
-        draw_triangles(points, self.robot.faces, pose.focal * width, width / 2, height / 2, depth, index)
+        posed, focal = camera_from_robot @ self.links[frame], pose.focal * width
+        project_vertices(self.robot.vertices, self._vertex_link, posed, focal, width / 2, height / 2, points)
+        draw_triangles(points, self.robot.faces, depth, index)
         return depth, index
 
     def outline(self, pose: Pose, size: tuple[int, int], moving: Bool[ndarray, " l"]) -> Outline:
@@ -92,23 +96,35 @@ class Posed:
             moving: the links whose outlines are wanted.
         """
         width, height = size
-        out = np.empty((width * height, 4))
-        parts: list[tuple[int, ndarray]] = []
         solid = np.empty((len(self), height, width), np.float32)
-        for frame in range(len(self)):
+
+        def traced(frame: int) -> Float64[ndarray, "n 4"]:
             depth, index = self._buffers(frame, pose, width, height)
-            count = trace_edges(index, depth, self.robot.face_link, moving, out)
-            parts.append((frame, out[:count].copy()))
             solid[frame] = cv2.GaussianBlur((index >= 0).astype(np.float32), (0, 0), NORMAL_PX)
-        frames = np.concatenate([np.full(len(part), frame) for frame, part in parts])
-        x, y, z, link = np.concatenate([part for _, part in parts]).T
+            out = np.empty((width * height, 4))
+            return out[: trace_edges(index, depth, self.robot.face_link, moving, out)].copy()
+
+        with ThreadPoolExecutor(os.cpu_count() or 1, "outlines") as pool:
+            parts = list(pool.map(traced, range(len(self))))
+        frames = np.concatenate([np.full(len(part), frame) for frame, part in enumerate(parts)])
+        x, y, z, link = np.concatenate(parts).T
         focal = pose.focal * width
         camera = np.stack([(x - width / 2) / focal * z, (y - height / 2) / focal * z, z], axis=1)
         point = (camera - pose.translation) @ pose.rotation
+        links = self.links[frames, link.astype(np.int32)]
+        on_link = np.einsum("nji,nj->ni", links[:, :3, :3], point - links[:, :3, 3])
         xy = np.stack([x, y], axis=1)
         _, slope = sampled(solid, frames, xy)
         normal = -slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-9)
-        return Outline(frames, xy, point, link.astype(np.int32), normal)
+        return Outline(frames, xy, point, on_link, link.astype(np.int32), normal)
+
+    def moved(self, outline: Outline, pose: Pose, size: tuple[int, int]) -> Outline:
+        """The same points of the links, as the links and the camera are now; cheaper than an outline drawn anew."""
+        links = self.links[outline.frame, outline.link]
+        point = np.einsum("nij,nj->ni", links[:, :3, :3], outline.on_link) + links[:, :3, 3]
+        camera = point @ pose.rotation.T + pose.translation
+        xy = pose.focal * size[0] * camera[:, :2] / camera[:, 2:].clip(0.01) + np.array(size) / 2
+        return replace(outline, xy=xy, point=point)
 
 
 def jacobian(

@@ -4,8 +4,11 @@ Masks hold more than the robot, and links may rest. So each pixel's course over 
 what does not move with the joints then weighs nothing.
 """
 
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
@@ -15,12 +18,12 @@ from lerobot_msdyn.robots.kernels import agreement, cover
 
 AZIMUTHS = 24
 ELEVATIONS_DEG = (-5, 10, 25, 40, 57, 75)
-FOVS_DEG = (45.0, 70.0)  # horizontal
+FOV_DEG = 56.0  # horizontal; others follow where a camera is improved
 SIZES = (0.05, 0.075, 0.11, 0.16, 0.23, 0.33)  # spread of the links' points, in widths of the picture
 FRAMES, POINTS, WIDTHS = (14, 20, 28), (300, 500, 900), (40, 56, 80)  # of the three stages
 POINTS_PER_CELL = 60  # of a hundredth of the picture; so many cover a cell
-FIRST, SECOND = 40, 8  # candidates that are improved, shortly and at length
-FIRST_STEPS, SECOND_STEPS = 110, 250
+TRIES = (36, 12, 6)  # candidates that are improved, one after the other at more length
+STEPS, STEP_SIZES = (60, 70, 180), (0.12, 0.06, 0.04)
 
 
 @dataclass(frozen=True)
@@ -65,11 +68,10 @@ class Agreement:
         self.centred = np.ascontiguousarray(np.moveaxis(small - small.mean(0), 0, -1))
         self.energy = float((self.centred.astype(np.float64) ** 2).sum())
         self._weight = POINTS_PER_CELL / points.shape[1] * self.height * width / 100
-        self._covered = np.empty_like(self.centred)
 
     def coverage(self, pose: Pose) -> Float32[ndarray, "h w t"]:
         """What a camera would see of the links."""
-        focal = pose.focal * self.width
+        focal, covered = pose.focal * self.width, np.empty_like(self.centred)
         cover(
             self.points,
             np.ascontiguousarray(pose.rotation),
@@ -78,9 +80,9 @@ class Agreement:
             self.width / 2,
             self.height / 2,
             self._weight,
-            self._covered,
+            covered,
         )
-        return self._covered
+        return covered
 
     def score(self, pose: Pose) -> float:
         """Correlation over time and pixels."""
@@ -101,41 +103,43 @@ def search(masks: Bool[ndarray, "t h w"], points: Float32[ndarray, "t n 3"]) -> 
         frames = np.linspace(0, len(masks) - 1, min(FRAMES[index], len(masks))).astype(int)
         return Agreement(masks[frames], points[frames][:, order[: POINTS[index]]], WIDTHS[index])
 
-    found = _distinct(_everywhere(stage(0)), FIRST)
+    found = _everywhere(stage(0))
     second, third = stage(1), stage(2)
-    found = _distinct([improved(second, each.pose, FIRST_STEPS, 0.12) for each in found], SECOND)
-    return _distinct([improved(third, each.pose, SECOND_STEPS, 0.04) for each in found], SECOND)
+    with ThreadPoolExecutor(os.cpu_count() or 1, "cameras") as pool:
+        for agreement_of, count, steps, size in zip((second, second, third), TRIES, STEPS, STEP_SIZES, strict=True):
+            tried = partial(improved, agreement_of, steps=steps, size=size)
+            found = list(pool.map(tried, [each.pose for each in _distinct(found, count)]))
+    return _distinct(found, len(found))
 
 
 def _everywhere(coarse: Agreement) -> list[Candidate]:
-    """The best place in the picture for each direction, size and field of view, by cross-correlation."""
+    """The best place in the picture for each direction and size, by cross-correlation."""
     height, width = coarse.height, coarse.width
     target = coarse.points.reshape(-1, 3).mean(0).astype(np.float64)
     spread = float(np.sqrt(((coarse.points.reshape(-1, 3) - target) ** 2).sum(1).mean()))
     size = (2 * height, 2 * width)
     masks = np.fft.rfft2(np.moveaxis(coarse.centred, -1, 0), size)
     window = np.fft.rfft2(np.ones((height, width), np.float32), size)
+    focal = 0.5 / float(np.tan(np.radians(FOV_DEG) / 2))
     found = []
     for elevation in np.radians(ELEVATIONS_DEG):
         for azimuth in np.arange(AZIMUTHS) * (2 * np.pi / AZIMUTHS):
             rotation = looking_at(azimuth, elevation)
-            for fov in np.radians(FOVS_DEG):
-                focal = 0.5 / np.tan(fov / 2)
-                for share in SIZES:
-                    distance = spread * focal / share
-                    if distance < 1.1 * spread:
-                        continue
-                    pose = Pose(rotation, np.array([0, 0, distance]) - rotation @ target, focal)
-                    covered = np.moveaxis(coarse.coverage(pose), -1, 0)
-                    product = np.fft.irfft2((masks * np.fft.rfft2(covered, size).conj()).sum(0), size)
-                    variance = np.fft.rfft2(covered.var(0) * len(covered), size).conj()
-                    square = np.fft.irfft2(window * variance, size)
-                    score = product / np.sqrt(np.maximum(square, 1e-3 * square.max() + 1e-9) * coarse.energy)
-                    best = int(score.argmax())
-                    row, column = divmod(best, size[1])
-                    row, column = (row + height) % size[0] - height, (column + width) % size[1] - width
-                    ray = np.array([column / width / focal, row / width / focal, 1.0])
-                    found.append(Candidate(_turned(pose, ray), float(score.flat[best])))
+            for share in SIZES:
+                distance = spread * focal / share
+                if distance < 1.1 * spread:
+                    continue
+                pose = Pose(rotation, np.array([0, 0, distance]) - rotation @ target, focal)
+                covered = np.moveaxis(coarse.coverage(pose), -1, 0)
+                product = np.fft.irfft2((masks * np.fft.rfft2(covered, size).conj()).sum(0), size)
+                variance = np.fft.rfft2(covered.var(0) * len(covered), size).conj()
+                square = np.fft.irfft2(window * variance, size)
+                score = product / np.sqrt(np.maximum(square, 1e-3 * square.max() + 1e-9) * coarse.energy)
+                best = int(score.argmax())
+                row, column = divmod(best, size[1])
+                row, column = (row + height) % size[0] - height, (column + width) % size[1] - width
+                ray = np.array([column / width / focal, row / width / focal, 1.0])
+                found.append(Candidate(_turned(pose, ray), float(score.flat[best])))
     return found
 
 

@@ -3,7 +3,7 @@
 import logging
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import cv2
@@ -22,12 +22,12 @@ logger = logging.getLogger(__name__)
 FEW = 28  # frames in which the camera is looked for by masks
 SHORT_FRAMES, SHORT_ROUNDS, SHORT_PX = 14, 8, (8.0, 3.0)  # of each candidate; loss in px of 320
 CANDIDATES = 3
-MASK_ROUNDS, MASK_PX = 7, (4.0, 1.5)
-EDGE_ROUNDS, EDGE_PX = 12, (2.0, 0.7)
-LAST_ROUNDS = 5  # with all frames
+MASK_ROUNDS, MASK_PX = 6, (4.0, 1.5)
+EDGE_ROUNDS, EDGE_PX = 10, (2.0, 0.7)
+LAST_ROUNDS = 4  # with all frames
 GROWN = 4  # px of 320 by which the robot is taken larger where the empty scene is looked for
 GOOD_HITS = 0.75  # below this, larger errors of the joints are looked for
-WIDE = Spread(offset_deg=4.0, scale=0.06)
+WIDE, WIDER_PX = Spread(offset_deg=4.0, scale=0.06, noise_deg=1.0), 2.0
 LEAST_GAIN = 0.015  # of the share of hits, by which corrected joints must fit better
 LEAST_HITS = 0.6  # share of the outlines that lie on edges
 LEAST_MARGIN = 0.04  # by which another camera must fit worse
@@ -80,9 +80,7 @@ def solve(robot: Robot, values: Float64[ndarray, "t j"], rate: Float64[ndarray, 
     """
     start = time.perf_counter()
     points = surface(robot, values)
-    order = spread_frames(points, len(points))
-    held = order[3::4]
-    used = np.array([frame for frame in order if frame not in set(held.tolist())])
+    used, held = _split(points)
     few = used[:FEW]
     masks = pictures.moving(few)
     coarse = Problem(robot, values[few], rate[few], signed_distance(masks), Spread())
@@ -93,6 +91,46 @@ def solve(robot: Robot, values: Float64[ndarray, "t j"], rate: Float64[ndarray, 
         verdict = max(verdict, other, key=lambda each: each[1])
     solution, share = verdict
     return Verdict(solution, share, margin, _doubt(solution, share, margin), time.perf_counter() - start)
+
+
+def with_joints(
+    verdict: Verdict,
+    other: Solution,
+    robot: Robot,
+    values: Float64[ndarray, "t j"],
+    rate: Float64[ndarray, "t j"],
+    pictures: Pictures,
+) -> Verdict:
+    """A camera again, with the joints as another camera of the same robot corrected them: both then share one world.
+
+    Args:
+        verdict: the camera that was found by itself.
+        other: the other one.
+        robot: as for `solve`, and all that follows.
+        values: of its joints in the frames of this camera.
+        rate: their change per second.
+        pictures: what these frames show.
+    """
+    start = time.perf_counter()
+    used, held = _split(surface(robot, values))
+    few = used[:FEW]
+    first = replace(other, pose=verdict.solution.pose, grown_px=0.0)
+    coarse = Problem(robot, values[few], rate[few], signed_distance(pictures.moving(few)), Spread())
+    tried: list[tuple[Solution, float]] = []
+    for spread in (Spread(), WIDE):
+        problem, solution, _ = _slid(coarse, first, values, rate, pictures, few, used, spread, False)
+        tried.append((solution, hits(problem, solution, held)))
+        if tried[-1][1] >= GOOD_HITS:
+            break
+    solution, share = max(tried, key=lambda each: each[1])
+    seconds = verdict.seconds + time.perf_counter() - start
+    return Verdict(solution, share, verdict.margin, _doubt(solution, share, verdict.margin), seconds)
+
+
+def _split(points: Float32[ndarray, "t n 3"]) -> tuple[Int64[ndarray, " u"], Int64[ndarray, " k"]]:
+    """Frames by how differently the robot stands in them: those that are used, and every fourth, which is held out."""
+    order = spread_frames(points, len(points))
+    return np.delete(order, np.s_[3::4]), order[3::4]
 
 
 def _chosen(coarse: Problem, found: list[Candidate]) -> tuple[Solution, float]:
@@ -126,7 +164,8 @@ def _slid(
     joints: bool,
 ) -> tuple[Problem, Solution, Solution]:
     """Onto masks of what moves, then onto those of the robot, then onto edges; without and with corrected joints."""
-    every, px = np.arange(len(few)), _px(MASK_PX, coarse)
+    wider = WIDER_PX if spread is WIDE else 1.0
+    every, px = np.arange(len(few)), _px(MASK_PX, coarse, wider)
     problem = Problem(coarse.robot, coarse.values, coarse.rate, coarse.distance, spread)
     solution = refined(problem, solution, every, MASK_ROUNDS, px, joints)
     problem = problem.with_masks(*pictures.masks(_about(problem, solution), few))
@@ -134,7 +173,7 @@ def _slid(
     none = np.zeros((len(values), *coarse.distance.shape[1:]), np.float32)
     problem = Problem(coarse.robot, values, rate, none, spread)
     problem = problem.with_difference(*pictures.difference(_about(problem, solution)))
-    px = _px(EDGE_PX, coarse)
+    px = _px(EDGE_PX, coarse, wider)
     solution = refined(problem, solution, used[: len(few)], EDGE_ROUNDS, px, joints)
     solution = refined(problem, solution, used, LAST_ROUNDS, (px[1], px[1]), joints)
     corrected = refined(problem, solution, used, LAST_ROUNDS, (px[1], px[1]), joints=True)
@@ -158,9 +197,9 @@ def _about(problem: Problem, solution: Solution) -> Bool[ndarray, "t h w"]:
     return np.stack([cv2.dilate((link >= 0).astype(np.uint8), kernel, iterations=grown) for link in links]) > 0
 
 
-def _px(scale: tuple[float, float], problem: Problem) -> tuple[float, float]:
+def _px(scale: tuple[float, float], problem: Problem, times: float = 1.0) -> tuple[float, float]:
     """Pixels of the pictures, of those of pictures 320 wide."""
-    factor = problem.size[0] / 320
+    factor = times * problem.size[0] / 320
     return scale[0] * factor, scale[1] * factor
 
 
