@@ -22,7 +22,7 @@ def between(default: Number, low: Number, high: Number) -> Any:
 
 
 def one_of(default: str, names: tuple[str, ...], *, registry: Registry | None = None) -> Any:
-    """One of some names, of the implementations in a registry (NAME or NAME:PARAMETER), or an exchange file FILE.npz."""
+    """One of some names, of the implementations in a registry (as NAME or NAME:PARAMETER), or a file FILE.npz."""
     return field(default=default, metadata={"names": names, "registry": registry})
 
 

@@ -28,7 +28,9 @@ def save_network(
     nodes.append(helper.make_node("Mul", [picture, "colours"], ["weighted"]))
     nodes.append(helper.make_node("ReduceSum", ["weighted", "axis"], ["sum"], keepdims=1))
     nodes += [helper.make_node("Reciprocal" if inverse else "Identity", ["sum"], [name]) for name in outputs]
-    given = [helper.make_tensor_value_info(name, TensorProto.FLOAT, (*shape[:-3], 1, rows, columns)) for name in outputs]
+    given = [
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, (*shape[:-3], 1, rows, columns)) for name in outputs
+    ]
     taken = helper.make_tensor_value_info("picture", kind, shape)
     graph = helper.make_graph(nodes, "tiny", [taken], given, [colours, axis])
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)

@@ -64,7 +64,8 @@ def test_colours_arrive_as_stated(networks, tmp_path: Path, stated, weights, exp
 
 
 @pytest.mark.parametrize(
-    "shape", [(1, 3, 12, 16), ("batch", 3, 12, 16), (1, 3, "height", "width"), (1, 1, 3, 12, 16), ("b", "n", 3, "h", "w")]
+    "shape",
+    [(1, 3, 12, 16), ("batch", 3, 12, 16), (1, 3, "height", "width"), (1, 1, 3, 12, 16), ("b", "n", 3, "h", "w")],
 )
 def test_pictures_keep_their_place(networks, tmp_path: Path, shape) -> None:
     """Also where the network takes another shape, and where it leaves its size open."""

@@ -18,7 +18,7 @@ from lerobot_msdyn.core.fields import between, problems
 
 NETWORK_SUFFIX, SPEC_SUFFIX = ".onnx", ".yaml"
 IMAGENET = {"mean": [0.485, 0.456, 0.406], "std": [0.229, 0.224, 0.225]}
-# Part of a file's name, without punctuation -> what networks of that family take and give. The longest that fits counts.
+# Part of a file's name, without punctuation -> what such networks take and give. The longest that fits counts.
 FAMILIES: dict[str, dict[str, Any]] = {
     "depthanythingv2": {"kind": "affine_disparity", **IMAGENET},
     "depthanythingv2metric": {"kind": "metric", **IMAGENET},

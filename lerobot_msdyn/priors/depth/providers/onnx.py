@@ -11,7 +11,8 @@ from lerobot_msdyn.core.observations import Model
 from lerobot_msdyn.priors.depth.metres import in_metres
 from lerobot_msdyn.priors.depth.onnx_network import OnnxNetwork
 from lerobot_msdyn.priors.depth.onnx_spec import NETWORK_SUFFIX, read_spec
-from lerobot_msdyn.priors.hub import UNKNOWN_LICENCE, demand_library
+from lerobot_msdyn.priors.hub import demand_library
+from lerobot_msdyn.priors.models import UNKNOWN_LICENCE
 from lerobot_msdyn.priors.registry import DEPTH, Depth, DepthProvider, Estimate, Masks, Unusable
 from lerobot_msdyn.priors.request import Request
 
