@@ -61,6 +61,8 @@ class Depth:
 
     z: Float[Tensor, "t h w"]  # m, z-depth; 0 = unknown
     traits: DepthTraits
+    # m, of the ground that things stand on (and of a wall behind it), where depth is that of a ground.
+    ground: Float[Tensor, "h w"] | None = None
 
 
 class Provider(ABC):

@@ -3,14 +3,15 @@
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
 
 from lerobot_msdyn.core.files import digest_of_file
 from lerobot_msdyn.core.observations import Model
 from lerobot_msdyn.priors.depth.metres import in_metres
 from lerobot_msdyn.priors.depth.onnx_network import OnnxNetwork
 from lerobot_msdyn.priors.depth.onnx_spec import NETWORK_SUFFIX, read_spec
+from lerobot_msdyn.priors.depth.predicted import predicted
 from lerobot_msdyn.priors.hub import demand_library
 from lerobot_msdyn.priors.models import UNKNOWN_LICENCE
 from lerobot_msdyn.priors.registry import DEPTH, Depth, DepthProvider, Estimate, Masks, Unusable
@@ -39,15 +40,11 @@ class Onnx(DepthProvider):
         digest = digest_of_file(self._file)
         intrinsics = request.view.camera.intrinsics[0]
 
-        def compute() -> dict[str, np.ndarray]:
-            values = OnnxNetwork(self._file, spec, request.device)(request.view.rgb, intrinsics).numpy()
-            known = np.abs(values[np.isfinite(values)])
-            unit = float(known.mean()) if len(known) and known.mean() > 0 else 1.0  # half floats hold what is near 1
-            return {"values": (values / unit).astype(np.float16), "unit": np.array(unit)}
+        def predict(rgb: UInt8[Tensor, "n h w 3"]) -> Float[Tensor, "n h w"]:
+            return OnnxNetwork(self._file, spec, request.device)(rgb, intrinsics)
 
         settings = {"file": digest, "spec": vars(spec), "focal_px": float(intrinsics[0, 0]) if spec.focal_px else 0}
-        arrays = request.cache.get("depth", "onnx", settings, compute)
-        values = torch.from_numpy(arrays["values"].astype(np.float32) * float(arrays["unit"]))
-        estimate = in_metres(request, instances, values, spec.kind, trusted=False)
+        values, elsewhere = predicted(request, "onnx", settings, predict)
+        estimate = in_metres(request, instances, values, spec.kind, trusted=False, elsewhere=elsewhere)
         model = Model(spec.model or self._file.name, spec.revision or digest, spec.licence or UNKNOWN_LICENCE)
         return replace(estimate, how=f"read {told}; {estimate.how}", model=model)
