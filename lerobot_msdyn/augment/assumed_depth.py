@@ -10,7 +10,7 @@ from lerobot_msdyn.core.config import PriorsConfig
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.core.fields import AUTO
 from lerobot_msdyn.dataset.read import depth_key_of
-from lerobot_msdyn.priors.fetch import fetch
+from lerobot_msdyn.priors.fetch import fetch, offline
 from lerobot_msdyn.priors.hub import demand_library, find_model, has_library
 from lerobot_msdyn.priors.models import MODELS, known_as
 
@@ -20,7 +20,7 @@ LIBRARY, EXTRA = "transformers", "priors"  # that runs the models, and how it is
 
 
 def say_assumed_depth(source: LeRobotDatasetMetadata, cameras: Sequence[str], config: AugmentConfig) -> None:
-    """Warn once per run where depth is that of a table plane, and fetch the better model where that is asked for.
+    """Warn once per run where depth is that of a table plane, or fetch the better model where that is asked for.
 
     Raises:
         PriorError: it is asked for and cannot be had.
@@ -30,7 +30,7 @@ def say_assumed_depth(source: LeRobotDatasetMetadata, cameras: Sequence[str], co
     if config.priors.depth != AUTO or recorded or _is_there(config.priors):
         return
     place = config.priors.depth_anything_metric_model
-    if config.fetch_models:
+    if config.fetch_models and not offline():
         name = known_as(place)
         if not name:
             raise ConfigError(
@@ -65,6 +65,5 @@ def _better(place: str) -> str:
         return ""
     install = "" if has_library(LIBRARY) else f" after pip install 'lerobot_msdyn[{EXTRA}]'"
     model = MODELS[name]
-    return (
-        f". Depth would be better with {place} ({model.size_mb} MB, {model.licence}): add --fetch_models true{install}"
-    )
+    how = f"nothing is downloaded while {offline()} is set" if offline() else f"add --fetch_models true{install}"
+    return f". Depth would be better with {place} ({model.size_mb} MB, {model.licence}): {how}"

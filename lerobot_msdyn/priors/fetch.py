@@ -62,9 +62,15 @@ def wrong_with(name: str) -> str:
     return f"{name}: {weights} is damaged or of another model (sha256 {digest[:8]}, not {model.sha256[:8]}): remove it"
 
 
+def offline() -> str:
+    """The variable of the environment by which nothing is to be downloaded; empty if there is none."""
+    set_to = {variable: os.environ.get(variable, "").lower() for variable in _OFFLINE}
+    return next((variable for variable, value in set_to.items() if value in ("1", "true", "yes", "on")), "")
+
+
 def _download(name: str, model: KnownModel) -> None:
-    if any(os.environ.get(variable, "").lower() in ("1", "true", "yes", "on") for variable in _OFFLINE):
-        raise PriorError(f"{name} is not on this machine, and nothing is downloaded while {_OFFLINE[0]} is set")
+    if offline():
+        raise PriorError(f"{name} is not on this machine, and nothing is downloaded while {offline()} is set")
     try:
         if model.is_file:
             path = checkpoint(model.file)

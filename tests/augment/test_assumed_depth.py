@@ -22,7 +22,14 @@ SOURCE = Mock(spec=LeRobotDatasetMetadata)
 def fetched(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The names of what was fetched, on a machine without models."""
     names: list[str] = []
-    monkeypatch.setattr(assumed_depth, "fetch", lambda name: names.append(name) or Path(name))
+
+    def fetch(name: str) -> Path:
+        names.append(name)
+        return Path(name)
+
+    for variable in ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setattr(assumed_depth, "fetch", fetch)
     monkeypatch.setattr(assumed_depth, "find_model", lambda name: None)
     monkeypatch.setattr(assumed_depth, "has_library", lambda name: True)
     monkeypatch.setattr(assumed_depth, "demand_library", lambda *args: None)
@@ -59,6 +66,13 @@ def test_the_model_is_fetched_where_that_is_asked_for(fetched, caplog) -> None:
         f"depth by {METRIC}: depth_anything_metric",
     ]
     assert fetched == ["depth_anything_metric"]
+
+
+def test_offline_nothing_is_fetched_and_the_plane_is_taken(fetched, caplog, monkeypatch) -> None:
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    [line] = said(caplog, AugmentConfig(fetch_models=True))
+    assert line.endswith("(99 MB, Apache-2.0): nothing is downloaded while HF_HUB_OFFLINE is set")
+    assert fetched == []
 
 
 def test_nothing_is_said_or_fetched_where_depth_is_not_assumed(fetched, caplog, monkeypatch) -> None:

@@ -286,8 +286,8 @@ def test_real_networks_tell_near_from_far(shared_data: Path, name: str) -> None:
     depth = 1 / values.clamp(min=1e-6) if spec.kind == "affine_disparity" else values
     assert depth[:, 200:].median() < 0.8 * depth[:, :60].median()
     truth = np.moveaxis(np.load(scene / "gt" / "train.npz")["depth"][..., :2], -1, 0).astype(np.float32)
-    ranks = [np.argsort(np.argsort(each[0, ::7, ::7].ravel())) for each in (depth.numpy(), truth)]
-    assert np.corrcoef(*ranks)[0, 1] > 0.7
+    one, other = (np.argsort(np.argsort(each[0, ::7, ::7].ravel())) for each in (depth.numpy(), truth))
+    assert np.corrcoef(one, other)[0, 1] > 0.7
 
 
 def test_a_missing_provider_is_still_a_config_error(view: View) -> None:

@@ -19,7 +19,7 @@ from lerobot_msdyn.priors.depth.align import MAX_FACTOR, scale_alone, scale_and_
 MOST_FRAMES = 60  # that a median is taken over
 MARGIN_PX = 4.0  # of 320: about what moves
 SPECK_PX = 5.0  # of 320: what is smaller, and said to stand on the ground, does not
-NEAR_GROUND = 0.12  # share of inverse depth by which a network may be off and mean the ground
+NEAR_GROUND = 0.09  # share of inverse depth by which a network may be off and mean the ground
 AGREES = 0.06  # the same, of those pixels that say how it is to be aligned
 FARTHEST_GROUND = 0.3  # share of the largest inverse depth of the ground, below which it is no evidence
 LEAST_GROUND = 0.15  # share of the pixels before that, that must agree

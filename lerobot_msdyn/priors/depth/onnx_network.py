@@ -137,10 +137,9 @@ class OnnxNetwork:
         image = np.full((self._height, self._width, _COLOURS), _GREY * spec.white, np.float32)
         inside = np.s_[place.top : place.top + place.height, place.left : place.left + place.width]
         image[inside] = cv2.resize(frame, size, interpolation=how).astype(np.float32) * (spec.white / 255)
-        if spec.channels == "bgr":
-            image = image[..., ::-1]
-        image = (image - np.float32(spec.mean)) / np.float32(spec.std)
-        arranged = image if self._axes == "bhwc" else image.transpose(2, 0, 1)
+        ordered = image[..., ::-1] if spec.channels == "bgr" else image
+        normal = (ordered - np.array(spec.mean, np.float32)) / np.array(spec.std, np.float32)
+        arranged = normal if self._axes == "bhwc" else normal.transpose(2, 0, 1)
         leading = (None,) * (len(self._axes) - arranged.ndim)
         if self._type is np.uint8:
             arranged = arranged.round()
