@@ -99,6 +99,14 @@ def test_a_thing_that_the_network_sees_well_keeps_its_depth(distance: float) -> 
     assert found[instances > 0].median().item() == pytest.approx(distance * GROUND[40, 0].item(), rel=0.02)
 
 
+def test_what_moves_is_not_below_the_ground() -> None:
+    instances, depth = NOTHING.clone(), clip(scene())
+    instances[:, 30:46, 20:50] = 1  # lies on the ground, and the network is off
+    depth[:, 30:46, 20:50] *= 1.1
+    found = put_together(1 / depth, instances)
+    assert (found <= 1.0001 * GROUND).all()
+
+
 def test_unknown_depth_of_what_moves_stays_unknown() -> None:
     inverse, instances = thing(1.0)
     inverse[3, 20:25, 33:36] = torch.nan

@@ -64,8 +64,9 @@ def fused(
     depth = (scale * inverse.nan_to_num(nan=0.0) + shift).clamp(min=least).reciprocal()
     depth = torch.where(torch.isfinite(inverse), depth, 0.0)
     empty = (scale * still.nan_to_num(nan=0.0) + shift).clamp(min=least)
-    empty = _above(empty, ground.reciprocal()) if known else empty
     moving = _not_behind_feet(depth, instances, standing)
+    if known:
+        empty, moving = _above(empty, ground.reciprocal()), torch.minimum(moving, ground)
     return torch.where(instances > 0, moving, empty.reciprocal())
 
 
