@@ -103,7 +103,7 @@ def test_depth_that_holds_nothing_is_named_and_auto_goes_on(view: View, caplog: 
         ({"depth": "depth_anything_metric"}, "models fetch depth_anything_metric$"),
         ({"masks": "sam2"}, "priors.masks is 'sam2', but .*models fetch sam2$"),
         ({"masks": "edgetam"}, "models fetch edgetam$"),
-        ({"tracks": "raft"}, "priors.tracks is 'raft', but RAFT's weights are not on this machine; fetch: python -c"),
+        ({"tracks": "raft"}, "'raft', but RAFT's weights are not on this machine; fetch: .*models fetch raft$"),
         ({"depth": "stereo"}, "priors.depth is 'stereo', but no other camera of the episode is read"),
         ({"depth": "absent.npz"}, "absent.npz: not a readable npz file"),
     ],
