@@ -47,7 +47,7 @@ from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.dataset.read import open_source, read_episode
 from lerobot_msdyn.dataset.select import select_cameras
 from lerobot_msdyn.priors import PointTracks, estimate_priors
-from lerobot_msdyn.priors.depth.table_plane import table_plane_depth
+from lerobot_msdyn.priors.depth.table_plane import table_plane, with_standing
 from lerobot_msdyn.priors.masks.moving import moving_instances, temporal_median
 from lerobot_msdyn.priors.tracks.flow import flow_tracks
 from lerobot_msdyn.synthetic import make_scene
@@ -235,8 +235,8 @@ def _true_plane(view: View, instances: torch.Tensor, truth: Truth) -> dict[str, 
     pose = truth.world_from_camera[0]
     height, tilt = float(pose[2, 3]) - truth.table_z, math.degrees(math.asin(-pose[2, 2]))
     intrinsics = torch.from_numpy(truth.intrinsics).float()
-    standing = table_plane_depth(instances, intrinsics, height, tilt).numpy()
-    bare = table_plane_depth(torch.zeros_like(instances), intrinsics, height, tilt).numpy()
+    bare_table = table_plane(view.camera.width, view.camera.height, intrinsics, height, tilt)
+    standing, bare = with_standing(bare_table, instances).numpy(), bare_table.numpy()[None]
     return {
         "true cam": abs_rel(standing, truth.depth),
         "moving": abs_rel(standing, truth.depth, truth.moving),
@@ -258,7 +258,7 @@ def timing() -> list[dict[str, Any]]:
             masks = time.process_time()
             flow_tracks(truth.rgb, instances)
             tracks = time.process_time()
-            table_plane_depth(instances, scene.camera.intrinsics[0], 0.5, 35.0)
+            with_standing(table_plane(width, height, scene.camera.intrinsics[0], 0.5, 35.0), instances)
             plane = time.process_time()
             row = {"size": f"{width}x{height}", "frames": frames}
             for name, seconds in (("masks", masks - start), ("tracks", tracks - masks), ("plane", plane - tracks)):

@@ -11,6 +11,7 @@ COMMANDS = {  # name -> module, purpose
     "augment": ("augment.__main__", "write new episodes of a dataset, seen from displaced cameras"),
     "viewer": ("viewer", "look at an episode, its scene and its new views in Rerun"),
     "priors": ("priors.__main__", "look at masks, depth and tracks of an episode"),
+    "models": ("models", "list, fetch and check the models that help"),
     "calibrate": ("calibrate", "where the cameras stand, by the robot's joints"),
     "recipes": ("recipes", "list, show and check recipes"),
     "export-ply": ("export_ply", "frames of a kept scene as .ply files"),

@@ -14,6 +14,7 @@ ONLY_IN = {
     "rerun": {"viewer"},
     "flip_evaluator": {"evaluate"},
     "lpips": {"evaluate"},
+    "onnxruntime": {"priors"},
     "lerobot": {"dataset", "augment", "training", "evaluate", "synthetic/dataset", "split", "carry"},
 }
 

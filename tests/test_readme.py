@@ -15,7 +15,7 @@ from lerobot_msdyn.synthetic.dataset import write_dataset
 
 PROJECT = Path(__file__).parent.parent
 IN_CI = {"make demo", "make test"}  # .ci/run
-BY_THE_WHEEL_TEST = {"pip install ."}
+BY_THE_WHEEL_TEST = {"pip install '.[priors]'"}
 
 
 def commands() -> list[str]:

@@ -12,6 +12,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
+from lerobot_msdyn.augment.assumed_depth import say_assumed_depth
 from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.augment.cost import (
     first_speeds,
@@ -27,7 +28,6 @@ from lerobot_msdyn.augment.workers import Work, Workers, quieten_stages, threads
 from lerobot_msdyn.core.errors import EpisodeError, MsdynError
 from lerobot_msdyn.dataset.convert import named_as_given
 from lerobot_msdyn.dataset.provenance import CALIBRATION
-from lerobot_msdyn.dataset.read import depth_key_of
 from lerobot_msdyn.dataset.rows import files_problem
 from lerobot_msdyn.dataset.write import NewEpisode, OutputDataset
 from lerobot_msdyn.render.devices import chosen_device
@@ -182,11 +182,4 @@ def _say_what_is_assumed(source: LeRobotDatasetMetadata, cameras: list[str], con
             "(--camera.calibration FILE, --camera.horizontal_fov_deg)",
             config.camera.horizontal_fov_deg,
         )
-    if config.priors.depth == "auto" and not all(depth_key_of(source, key) for key in cameras):
-        logger.warning(
-            "no recorded depth: unless a learned model or several calibrated cameras supply it, scenes are built on a "
-            "table plane seen from %g m at %g degrees (--camera.height_m, --camera.tilt_deg); keep the changes of view "
-            "small",
-            config.camera.height_m,
-            config.camera.tilt_deg,
-        )
+    say_assumed_depth(source, cameras, config)

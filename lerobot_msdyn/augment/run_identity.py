@@ -18,11 +18,13 @@ from lerobot.utils.constants import HF_LEROBOT_HOME
 
 from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.core.config import Recipe
+from lerobot_msdyn.core.fields import PARAMETER
 from lerobot_msdyn.core.files import DIGEST_BYTES, digest_of_file
 from lerobot_msdyn.core.plugins import plugin_digests
 from lerobot_msdyn.core.registry import extending_packages
 from lerobot_msdyn.dataset.checks import place_problem
 from lerobot_msdyn.dataset.rows import data_files
+from lerobot_msdyn.priors.depth.onnx_spec import NETWORK_SUFFIX, SPEC_SUFFIX
 from lerobot_msdyn.render.devices import chosen_device
 
 LIBRARIES = ("lerobot_msdyn", "lerobot", "torch", "numpy", "opencv-python-headless", "av", "numba", "pyarrow")
@@ -94,8 +96,11 @@ def recipe_text(config: Recipe) -> str:
 
 
 def _named_files(settings: Any) -> list[Path]:
-    """The files that settings name: calibrations, exchange files, weights."""
+    """The files that settings name: calibrations, exchange files, weights, and a network's YAML beside it."""
     if isinstance(settings, dict):
         return [path for value in settings.values() for path in _named_files(value)]
-    is_file = isinstance(settings, str) and Path(settings).suffix != "" and Path(settings).is_file()
-    return [Path(settings)] if is_file else []
+    if not isinstance(settings, str):
+        return []
+    named = [Path(text) for text in (settings, settings.partition(PARAMETER)[2])]
+    beside = [path.with_suffix(SPEC_SUFFIX) for path in named if path.suffix == NETWORK_SUFFIX]
+    return [path for path in [*named, *beside] if path.suffix != "" and path.is_file()]

@@ -11,7 +11,18 @@ from typing import Any, Literal
 import draccus
 
 from lerobot_msdyn.core.errors import ConfigError, one_line
-from lerobot_msdyn.core.fields import AUTO, FILE, INFINITY, MAX_SEED, MAX_WEIGHT, between, numbers_of, one_of, problems
+from lerobot_msdyn.core.fields import (
+    AUTO,
+    FILE,
+    INFINITY,
+    MAX_SEED,
+    MAX_WEIGHT,
+    PARAMETER,
+    between,
+    numbers_of,
+    one_of,
+    problems,
+)
 from lerobot_msdyn.core.perturbation import Perturbation
 from lerobot_msdyn.core.registries import CAMERAS, DEPTH, LOSSES, MASKS, MOTION_LEVELS, TRACKS
 from lerobot_msdyn.core.registry import Registry
@@ -73,7 +84,7 @@ class PriorsConfig:
     """What is known about a video before the fit: each by a provider (docs/priors.md), yours too (--plugins)."""
 
     # auto (recorded, else a learned model that is on this machine, else stereo, else plane), recorded, plane,
-    # depth_anything, depth_anything_metric, stereo (two or more calibrated cameras), or an .npz file.
+    # depth_anything, depth_anything_metric, onnx:FILE.onnx, stereo (two or more calibrated cameras), or an .npz file.
     depth: str = one_of(AUTO, (AUTO,), registry=DEPTH)
     # auto (a learned model that is on this machine, else change), change, sam2, edgetam, or an .npz file.
     masks: str = one_of(AUTO, (AUTO,), registry=MASKS)
@@ -83,6 +94,9 @@ class PriorsConfig:
     depth_anything_model: str = "depth-anything/Depth-Anything-V2-Small-hf"
     # Model of `depth_anything_metric`: an id on the hub or a folder.
     depth_anything_metric_model: str = "depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf"
+    # Of the network of `onnx:FILE.onnx`: what it takes and gives, where neither FILE.yaml beside it nor its name tells,
+    # e.g. --priors.onnx.kind metric (docs/priors.md).
+    onnx: dict[str, Any] = field(default_factory=dict)
     # Model of `sam2`: an id on the hub or a folder.
     sam2_model: str = "facebook/sam2.1-hiera-tiny"
     # Model of `edgetam`: an id on the hub or a folder.
@@ -101,7 +115,8 @@ class PriorsConfig:
     @property
     def reads_recorded_depth(self) -> bool:
         """Whether recorded depth can be of use, so that its videos have to be decoded."""
-        return self.depth not in DEPTH or bool(DEPTH.get(self.depth).reads_recorded_depth)
+        name = self.depth.partition(PARAMETER)[0]
+        return name not in DEPTH or bool(DEPTH.get(name).reads_recorded_depth)
 
 
 @dataclass
@@ -311,5 +326,6 @@ class Recipe:
         return self.priors.needs_whole_videos or self.camera.needs_whole_videos
 
 
-def _needs_whole_videos(name: str, registry: Registry) -> bool:
-    return name.endswith(FILE) or (name in registry and bool(registry.get(name).needs_whole_videos))
+def _needs_whole_videos(choice: str, registry: Registry) -> bool:
+    name = choice.partition(PARAMETER)[0]
+    return choice.endswith(FILE) or (name in registry and bool(registry.get(name).needs_whole_videos))

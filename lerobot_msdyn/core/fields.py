@@ -10,6 +10,7 @@ Number = int | float
 INFINITY = float("inf")
 AUTO = "auto"  # the best of what can be used
 FILE = ".npz"  # ending of an exchange file
+PARAMETER = ":"  # between the name of an implementation and what it is to take
 MAX_INDEX = 1_000_000_000  # of an episode
 MAX_SEED = 4_294_967_295
 MAX_WEIGHT = 1e6  # of a loss term
@@ -21,7 +22,7 @@ def between(default: Number, low: Number, high: Number) -> Any:
 
 
 def one_of(default: str, names: tuple[str, ...], *, registry: Registry | None = None) -> Any:
-    """One of some names, of the implementations in a registry, or an exchange file FILE.npz."""
+    """One of some names, of the implementations in a registry (as NAME or NAME:PARAMETER), or a file FILE.npz."""
     return field(default=default, metadata={"names": names, "registry": registry})
 
 
@@ -47,8 +48,10 @@ def problems(config: Any, prefix: str = "") -> list[str]:
             lines += _range_problems(value, name, *item.metadata["range"])
         elif "names" in item.metadata:
             registry: Registry | None = item.metadata["registry"]
-            allowed = [*item.metadata["names"], *(registry.names() if registry is not None else ())]
-            if value not in allowed and not value.endswith(FILE):
+            registered = registry.names() if registry is not None else []
+            allowed = [*item.metadata["names"], *registered]
+            with_parameter = PARAMETER in value and value.partition(PARAMETER)[0] in registered
+            if value not in allowed and not with_parameter and not value.endswith(FILE):
                 lines.append(f"{name} is {value!r}; expected {', '.join(allowed)} or a file FILE{FILE}")
     between_fields = getattr(config, "problems", None)
     return lines + ([prefix + line for line in between_fields()] if between_fields is not None else [])

@@ -12,19 +12,30 @@ Protocol = Literal["som", "dycheck"]
 
 
 @dataclass
-class EvaluateConfig(Recipe):
+class ScoredConfig(Recipe):
+    """What all evaluations share."""
+
+    # AlexNet's features for mLPIPS: the state of lpips.LPIPS(net='alex').net, or torchvision's checkpoint. Default:
+    # where `python -m lerobot_msdyn.models fetch alexnet` puts it. Without, mLPIPS is left out.
+    lpips_weights: Path | None = None
+
+
+@dataclass
+class EvaluateConfig(ScoredConfig):
     """`python -m lerobot_msdyn.evaluate nvs`: fit one episode, render its held-out cameras."""
 
     # Folder with dataset/ (or dataset_depth/) and gt/, see docs/evaluate.md.
     scene_folder: Path = Path()
     # Where the rendered views go: OUT/<camera>/rgb_%04d.png; and OUT/scores.json.
     out: Path = Path()
-    # recorded, none, or an .npz file with depth [t,h,w].
+    # recorded, none, another provider of priors.depth (onnx:FILE.onnx), or an .npz file with depth [t,h,w].
     depth: str = "recorded"
+    # Whether one factor of all depths is fitted to the true views as well, which tells wrong shape from wrong scale.
+    fit_scale: bool = False
 
 
 @dataclass
-class DycheckConfig(Recipe):
+class DycheckConfig(ScoredConfig):
     """`python -m lerobot_msdyn.evaluate dycheck`: fit a DyCheck iPhone sequence, score its validation views."""
 
     # Folder of the sequence, with rgb/, splits/ and so on, see docs/evaluate.md.
@@ -36,7 +47,7 @@ class DycheckConfig(Recipe):
 
 
 @dataclass
-class HeldoutCameraConfig(Recipe):
+class HeldoutCameraConfig(ScoredConfig):
     """`python -m lerobot_msdyn.evaluate heldout-camera`: fit one camera of a rig, score what another one saw."""
 
     # Source dataset (alias: --repo).

@@ -17,7 +17,7 @@ from lerobot_msdyn.dataset.read import Episode, open_source, read_episode
 from lerobot_msdyn.dataset.select import colour_cameras, select_cameras
 from lerobot_msdyn.evaluate.colour import fit_colours
 from lerobot_msdyn.evaluate.config import HeldoutCameraConfig
-from lerobot_msdyn.evaluate.perceptual import without_flip
+from lerobot_msdyn.evaluate.perceptual import SpatialNetwork, lpips_network, without_flip, without_lpips
 from lerobot_msdyn.evaluate.scores import (
     NEVER,
     SEEN,
@@ -70,9 +70,14 @@ def evaluate_heldout(config: HeldoutCameraConfig) -> Evaluated:
         moving = estimate_masks(held_out, config.priors, config.camera, episode=config.episode, key=test).numpy() > 0
         covered &= shows_something(held_out.rgb.numpy())
         truth = TrueViews(held_out.rgb.numpy(), np.where(covered, SEEN, NEVER).astype(np.uint8), moving)
-        rows = {name: score_half(pictures, truth) for name, pictures in shown.items()}
+        lpips = None if without_lpips(config.lpips_weights) else lpips_network(config.lpips_weights)
+        rows = {name: score_half(pictures, truth, lpips) for name, pictures in shown.items()}
         rows["this fit"] |= source_shares(scene, held_out.camera, torch.arange(len(rendered)), truth)
-    notices = [without_flip(), "" if scene.metric else "no depth warp: the depth is not metric, nor is the fit's place"]
+    notices = [
+        without_flip(),
+        without_lpips(config.lpips_weights),
+        "" if scene.metric else "no depth warp: the depth is not metric, nor is the fit's place",
+    ]
     content: dict[str, Any] = {"train_camera": train, "test_camera": test, "depth_from": helpers, "rows": rows}
     content |= {"what_moves": scene.account.entry()}
     content |= {"depth": scene.provenance["depth"], "covered": float(covered.mean()), "pictures": len(rendered)}
@@ -134,8 +139,8 @@ def _warped(scene: Reconstruction, view: View, camera: CameraTrack) -> Pictures:
     return np.stack(pictures)
 
 
-def score_half(rendered: Pictures, truth: TrueViews) -> Scores:
+def score_half(rendered: Pictures, truth: TrueViews, lpips: SpatialNetwork | None = None) -> Scores:
     """Scores of the one half of the frames, in colours fitted to the other half."""
     colours = fit_colours(rendered[FIT], truth.rgb[FIT], truth.seen[FIT] != NEVER)
     scored = TrueViews(truth.rgb[SCORED], truth.seen[SCORED], None if truth.moving is None else truth.moving[SCORED])
-    return score_views(colours.apply(rendered[SCORED]), scored)
+    return score_views(colours.apply(rendered[SCORED]), scored, lpips)

@@ -4,6 +4,7 @@ The fit reads nothing of `gt/` but the recorded camera; the truth is read after 
 """
 
 import json
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,8 @@ from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.dataset.read import open_source, read_episode
 from lerobot_msdyn.dataset.select import select_cameras
 from lerobot_msdyn.evaluate.config import EvaluateConfig
-from lerobot_msdyn.evaluate.perceptual import without_flip
+from lerobot_msdyn.evaluate.perceptual import SpatialNetwork, lpips_network, without_flip, without_lpips
+from lerobot_msdyn.evaluate.scale import HeldOut, at_scale, fitted_scale
 from lerobot_msdyn.evaluate.scores import (
     Evaluated,
     Scores,
@@ -43,13 +45,16 @@ def evaluate_nvs(config: EvaluateConfig) -> Evaluated:
 
     Raises:
         DatasetError: a file of the folder is absent or not as documented.
+        ConfigError: the weights for mLPIPS cannot be used, or a scale is to be fitted to a camera that moves.
     """
     seconds: dict[str, float] = {}
     with timed(seconds, "read"):
         view = read_view(config)
     config.priors.depth = {"recorded": "recorded", "none": "plane"}.get(config.depth, config.depth)
     scene = timed_reconstruction(seconds, view, config)
+    lpips = None if without_lpips(config.lpips_weights) else lpips_network(config.lpips_weights)
     cameras: dict[str, Scores] = {}
+    held_out: dict[str, HeldOut] = {}
     pictures = 0
     for path in sorted((config.scene_folder / "gt" / "heldout").glob("*.npz")):
         with timed(seconds, "render"):
@@ -60,23 +65,50 @@ def evaluate_nvs(config: EvaluateConfig) -> Evaluated:
         with timed(seconds, "score"):
             truth = read_truth(config.scene_folder, path.stem)
             if truth is not None:
-                cameras[path.stem] = score_views(rendered, truth)
+                cameras[path.stem] = score_views(rendered, truth, lpips)
+                held_out[path.stem] = HeldOut(camera, frames, truth)
         if truth is not None and truth.moving is not None:
             with timed(seconds, "render without overlay"):
                 alone = _render(scene.without_overlay(), camera, frames)
             account = {"dyn_psnr_without_overlay": dynamic_psnr_db(alone, truth)}
             cameras[path.stem] |= account | source_shares(scene, camera, frames, truth)
-    mean = mean_scores([*cameras.values()])
-    notices = [without_flip()] if cameras else ["no scores: no true views with covis in gt/heldout"]
+    rows = cameras | {"mean": mean_scores([*cameras.values()])}
+    notices = (
+        [without_flip(), without_lpips(config.lpips_weights)]
+        if cameras
+        else ["no scores: no true views with covis in gt/heldout"]
+    )
     content: dict[str, Any] = {
         "scene": config.scene_folder.name,
         "cameras": cameras,
-        "mean": mean,
+        "mean": rows["mean"],
         "pictures": pictures,
         "what_moves": scene.account.entry(),
     }
+    if config.fit_scale and held_out:
+        with timed(seconds, "scale"):
+            content["scale"] = _at_fitted_scale(scene, held_out, lpips)
+        factor = content["scale"]["factor"]
+        rows[f"mean, depth x {factor:.3f}"] = content["scale"]["mean"]
+        notices.append(f"depth x {factor:.3f}: one factor, fitted to the true views; all other rows are as they are")
     content |= {"seconds": seconds, "notices": [notice for notice in notices if notice]}
-    return Evaluated(content, score_table(cameras | {"mean": mean}) if cameras else "", config.out).written()
+    return Evaluated(content, score_table(rows) if cameras else "", config.out).written()
+
+
+def _at_fitted_scale(
+    scene: Reconstruction, held_out: Mapping[str, HeldOut], lpips: SpatialNetwork | None
+) -> dict[str, Any]:
+    """The factor of all depths that fits the true views best, and the scores with it."""
+
+    def rendered(view: HeldOut, camera: CameraTrack) -> UInt8[ndarray, "n h w 3"]:
+        return _render(scene, camera, view.frames)
+
+    factor = fitted_scale(scene.camera, [*held_out.values()], rendered)
+    cameras = {
+        name: score_views(rendered(view, at_scale(view.camera, scene.camera, view.frames, factor)), view.truth, lpips)
+        for name, view in held_out.items()
+    }
+    return {"factor": factor, "cameras": cameras, "mean": mean_scores([*cameras.values()])}
 
 
 def read_view(config: EvaluateConfig) -> View:

@@ -22,7 +22,7 @@ from torch import Tensor
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.files import write_whole
 from lerobot_msdyn.evaluate.metrics import flicker, inside_ssim, masked_psnr_db
-from lerobot_msdyn.evaluate.perceptual import masked_flip, without_flip
+from lerobot_msdyn.evaluate.perceptual import SpatialNetwork, masked_flip, masked_lpips, without_flip
 from lerobot_msdyn.reconstruction.account import Account, account_line
 from lerobot_msdyn.reconstruction.result import Reconstruction
 from lerobot_msdyn.scene.sources import MovingPixels, sources_of
@@ -84,11 +84,11 @@ class Evaluated:
         )
 
 
-def score_views(rendered: UInt8[ndarray, "n h w 3"], true: TrueViews) -> Scores:
+def score_views(rendered: UInt8[ndarray, "n h w 3"], true: TrueViews, lpips: SpatialNetwork | None = None) -> Scores:
     """Means over the frames of one camera that stands still; of a kind of pixels that no frame has enough of: none.
 
-    psnr, ssim, flip: over what the recorded camera saw at any time; dyn_*: the moving part of it; dis_psnr: what it
-    saw at other times only; flicker (levels of 0..255): over what stands still of what it saw.
+    psnr, ssim, flip, mlpips (with a network): over what the recorded camera saw at any time; dyn_*: the moving part of
+    it; dis_psnr: what it saw at other times only; flicker (levels of 0..255): over what stands still of what it saw.
     """
     frames: list[Scores] = []
     perceptual = without_flip() == ""
@@ -102,6 +102,8 @@ def score_views(rendered: UInt8[ndarray, "n h w 3"], true: TrueViews) -> Scores:
         scores |= {f"{kind}ssim": inside_ssim(picture, truth, mask) for kind, mask in enough.items() if kind != "dis_"}
         if perceptual and "" in enough:
             scores["flip"] = masked_flip(picture, truth, covered)
+        if lpips is not None and "" in enough:
+            scores["mlpips"] = masked_lpips(picture, truth, covered, lpips)
         frames.append(scores)
     still = true.seen != NEVER if true.moving is None else (true.seen != NEVER) & ~true.moving
     return mean_scores(frames) | {"flicker": flicker(rendered, true.rgb, still)}

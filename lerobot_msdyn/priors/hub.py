@@ -1,30 +1,15 @@
-"""Learned models that are on this machine already, with their licences. Nothing is ever downloaded from here."""
+"""Learned models that are on this machine already. Nothing is ever downloaded from here: `priors.fetch` does that."""
 
 import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
 from huggingface_hub import constants, try_to_load_from_cache
 
 from lerobot_msdyn.core.observations import Model
+from lerobot_msdyn.priors.models import MODELS, UNKNOWN_LICENCE, how_to_fetch, known_as, licence_of
 from lerobot_msdyn.priors.registry import Unusable
-
-UNKNOWN_LICENCE = "unknown: read its model card"
-NON_COMMERCIAL = "CC-BY-NC-4.0"
-# As their model cards state them; no default of this package is restricted to non-commercial use.
-LICENCES = {
-    "facebook/sam2.1-hiera-tiny": "Apache-2.0",
-    "facebook/sam2.1-hiera-small": "Apache-2.0",
-    "facebook/sam2.1-hiera-base-plus": "Apache-2.0",
-    "facebook/sam2.1-hiera-large": "Apache-2.0",
-    "yonigozlan/EdgeTAM-hf": "Apache-2.0",
-    "depth-anything/Depth-Anything-V2-Small-hf": "Apache-2.0",
-    "depth-anything/Depth-Anything-V2-Base-hf": NON_COMMERCIAL,
-    "depth-anything/Depth-Anything-V2-Large-hf": NON_COMMERCIAL,
-    "depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf": "Apache-2.0",
-    "depth-anything/Depth-Anything-V2-Metric-Indoor-Base-hf": NON_COMMERCIAL,
-    "depth-anything/Depth-Anything-V2-Metric-Indoor-Large-hf": NON_COMMERCIAL,
-}
 
 
 @dataclass(frozen=True)
@@ -42,15 +27,15 @@ def find_model(name: str, licence: str = UNKNOWN_LICENCE) -> LocalModel | None:
 
     Args:
         name: the id or the folder.
-        licence: that of a model which `LICENCES` does not list.
+        licence: that of a model which `priors.models` does not list.
     """
-    licence = LICENCES.get(name, licence)
+    licence = licence_of(name, licence)
     folder = Path(name).expanduser()
     if _is_complete(folder):
         return LocalModel(name, "local", licence, folder)
     if name.count("/") != 1 or folder.is_absolute():
         return None
-    config = _cached_config(name)
+    config = cached_config(name)
     if config is None or not _is_complete(config.parent):
         return None
     return LocalModel(name, config.parent.name, licence, config.parent)
@@ -61,7 +46,7 @@ def local_model(name: str, licence: str = UNKNOWN_LICENCE, *, companion: str = "
 
     Args:
         name: the id or the folder.
-        licence: that of a model which `LICENCES` does not list.
+        licence: that of a model which `priors.models` does not list.
         companion: id of a model whose configuration transformers reads as it loads this one.
 
     Raises:
@@ -70,11 +55,11 @@ def local_model(name: str, licence: str = UNKNOWN_LICENCE, *, companion: str = "
     demand_library("transformers", "priors", f"the model {name}")
     model = find_model(name, licence)
     if model is None:
-        raise Unusable(f"the model {name} is not on this machine", f"fetch it with: hf download {name}")
-    if companion and _cached_config(companion) is None:
+        raise Unusable(f"the model {name} is not on this machine", f"fetch it with: {how_to_fetch(name)}")
+    if companion and cached_config(companion) is None:
         raise Unusable(
             f"the model {name} needs the configuration of {companion} as well",
-            f"fetch it with: hf download {companion} config.json",
+            f"fetch it with: {how_to_fetch(name) if known_as(name) else f'hf download {companion} config.json'}",
         )
     return model
 
@@ -97,7 +82,17 @@ def _is_complete(folder: Path) -> bool:
     return (folder / "config.json").is_file() and any(folder.glob("*.safetensors"))
 
 
-def _cached_config(name: str) -> Path | None:
-    """The configuration of a model in the local Hugging Face cache."""
-    path = try_to_load_from_cache(name, "config.json", cache_dir=constants.HF_HUB_CACHE)
-    return Path(path) if isinstance(path, str) else None
+def cached_config(name: str) -> Path | None:
+    """The configuration of a model in the local Hugging Face cache: of the revision that is meant, else of any."""
+    known = known_as(name)
+    revisions = [MODELS[known].revision] if known and MODELS[known].revision else []
+    for revision in [*revisions, "main"]:
+        path = try_to_load_from_cache(name, "config.json", cache_dir=constants.HF_HUB_CACHE, revision=revision)
+        if isinstance(path, str):
+            return Path(path)
+    return None
+
+
+def checkpoint(file: str) -> Path:
+    """Where torch keeps a single file of weights."""
+    return Path(torch.hub.get_dir()) / "checkpoints" / file

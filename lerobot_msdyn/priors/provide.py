@@ -5,7 +5,7 @@ import logging
 from collections.abc import Callable
 
 from lerobot_msdyn.core.errors import ConfigError, PriorError
-from lerobot_msdyn.core.fields import AUTO, FILE
+from lerobot_msdyn.core.fields import AUTO, FILE, PARAMETER
 from lerobot_msdyn.core.observations import Origin
 from lerobot_msdyn.priors.registry import Estimate, Provider, Unusable
 from lerobot_msdyn.priors.request import Request
@@ -20,7 +20,7 @@ def provide[P: Provider, T](
 
     Args:
         kind: which prior: the base class of its providers.
-        wanted: `auto`, the name of a provider, or an exchange file.
+        wanted: `auto`, the name of a provider (NAME or NAME:PARAMETER), or an exchange file.
         request: what the provider is given.
         run: calls the provider's `estimate`.
         file: makes the provider that reads an exchange file.
@@ -32,8 +32,8 @@ def provide[P: Provider, T](
     if wanted == AUTO:
         return best(kind, request, run)
     is_file = wanted.endswith(FILE)
-    provider = file(wanted) if is_file else _named(kind, wanted)()
-    name, why = ("file", f"read from {wanted}") if is_file else (wanted, "asked for")
+    provider = file(wanted) if is_file else _made(kind, wanted)
+    name, why = ("file", f"read from {wanted}") if is_file else (wanted.partition(PARAMETER)[0], "asked for")
     try:
         provider.usable(request)
         return _run(kind, name, provider, request, run, why)
@@ -98,9 +98,24 @@ def _ranked[P: Provider](kind: type[P]) -> list[tuple[str, type[P]]]:
         except ConfigError as error:  # another package's: nobody has asked for it
             logger.warning("%s is left out: %s", name, error)
             continue
-        if provider.rank is not None and not provider.needs_whole_videos:
+        if provider.rank is not None and not provider.needs_whole_videos and not provider.parameter:
             ranked.append((name, provider))
     return sorted(ranked, key=lambda item: (-(item[1].rank or 0), item[0]))
+
+
+def _made[P: Provider](kind: type[P], wanted: str) -> P:
+    """The provider of NAME or NAME:PARAMETER.
+
+    Raises:
+        ConfigError: there is none, or it takes a parameter and has none, or the other way round.
+    """
+    name, colon, parameter = wanted.partition(PARAMETER)
+    provider = _named(kind, name)
+    if bool(provider.parameter) != bool(parameter):
+        expected = f"{name}:{provider.parameter}" if provider.parameter else f"{name} alone"
+        raise ConfigError(f"{kind.setting} is {wanted!r}; expected {expected}")
+    make: Callable[..., P] = provider
+    return make(parameter) if colon else make()
 
 
 def _named[P: Provider](kind: type[P], name: str) -> type[P]:

@@ -61,10 +61,15 @@ class Depth:
 
     z: Float[Tensor, "t h w"]  # m, z-depth; 0 = unknown
     traits: DepthTraits
+    # m, of the ground that things stand on (and of a wall behind it), where depth is that of a ground.
+    ground: Float[Tensor, "h w"] | None = None
 
 
 class Provider(ABC):
-    """One way to get a prior. It is made without arguments, once per video, and keeps nothing between videos."""
+    """One way to get a prior. It is made once per video, and keeps nothing between videos.
+
+    It is made without arguments, or, where it has a `parameter`, with the text behind its name and a colon.
+    """
 
     prior: ClassVar[str]
     setting: ClassVar[str]
@@ -72,6 +77,8 @@ class Provider(ABC):
 
     # `auto` tries the highest first; None: it is used only where it is asked for by name.
     rank: ClassVar[int | float | None] = None
+    # What must stand behind its name and a colon in the settings, e.g. "FILE.onnx"; empty: it takes nothing.
+    parameter: ClassVar[str] = ""
     # Whether it must see a video as a whole: then long ones are not fitted part by part, and `auto` leaves it out.
     needs_whole_videos: ClassVar[bool] = False
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.evaluate import perceptual
-from lerobot_msdyn.evaluate.perceptual import masked_flip, masked_lpips, without_flip, without_lpips
+from lerobot_msdyn.evaluate.perceptual import lpips_network, masked_flip, masked_lpips, without_flip, without_lpips
 
 
 def pair(noise: float) -> tuple[np.ndarray, np.ndarray]:
@@ -71,15 +72,78 @@ def test_mlpips_of_the_library(monkeypatch: pytest.MonkeyPatch) -> None:
     assert 0 < values[1] < values[2]
 
 
+@pytest.fixture
+def alexnet(monkeypatch: pytest.MonkeyPatch) -> dict[str, torch.Tensor]:
+    """Weights of AlexNet's convolutions as torchvision names them."""
+    generator = torch.Generator().manual_seed(0)
+    state = {}
+    for name, shape in perceptual._SHAPES.items():
+        state[f"features.{name}"] = 0.02 * torch.randn(shape, generator=generator)
+        state[f"features.{name.replace('weight', 'bias')}"] = torch.zeros(shape[0])
+    return state
+
+
+def as_of_lpips(state: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    slices = {"0": 1, "3": 2, "6": 3, "8": 4, "10": 5}
+    return {name.replace("features", f"slice{slices[name.split('.')[1]]}"): value for name, value in state.items()}
+
+
+@pytest.mark.slow
+def test_both_forms_of_weights_give_the_same_distance(alexnet, tmp_path: Path) -> None:
+    pytest.importorskip("lpips")
+    files = tmp_path / "alexnet.pth", tmp_path / "lpips.pt"
+    torch.save(alexnet | {"classifier.1.weight": torch.zeros(3)}, files[0])
+    torch.save(as_of_lpips(alexnet), files[1])
+    full = np.ones((48, 64), bool)
+    one, other = (masked_lpips(*pair(30), full, lpips_network(file)) for file in files)
+    assert one == other > 0
+    alexnet["features.0.weight"] = alexnet["features.0.weight"].flip(0) ** 3
+    torch.save(alexnet, files[0])
+    assert masked_lpips(*pair(30), full, lpips_network(files[0])) != one
+
+
+def test_a_file_of_something_else_is_named_in_a_line(alexnet, tmp_path: Path) -> None:
+    class Evil:
+        def __reduce__(self):
+            return (print, ("run",))
+
+    path = tmp_path / "weights.pt"
+    wrong: list[object] = [
+        {},
+        [1, 2],
+        {**alexnet, "features.0.weight": torch.zeros(64, 3, 3, 3)},
+        {name: value for name, value in alexnet.items() if "10" not in name},
+        Evil(),
+    ]
+    for content in wrong:
+        torch.save(content, path)
+        with pytest.raises(
+            ConfigError, match=r"lpips_weights: .*weights\.pt (holds no AlexNet|cannot be read)"
+        ) as caught:
+            lpips_network(path)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(ConfigError, match=r"absent\.pt cannot be read"):
+        lpips_network(tmp_path / "absent.pt")
+
+
+@pytest.mark.slow
+def test_real_weights_tell_a_small_difference_from_a_large_one(shared_data: Path) -> None:
+    pytest.importorskip("lpips")
+    network = lpips_network(shared_data / "models" / "lpips_alexnet_features.pt")
+    full = np.ones((48, 64), bool)
+    values = [masked_lpips(*pair(noise), full, network) for noise in (0, 4, 60)]
+    assert values[0] == 0
+    assert 2 * values[1] < values[2]
+
+
 def test_what_is_absent_is_said_in_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     if perceptual.has_library("lpips"):
-        from torchvision.models import AlexNet_Weights
-
-        assert AlexNet_Weights.IMAGENET1K_V1.url.endswith(f"/{perceptual.ALEXNET}")
         assert f"AlexNet's weights are not in {tmp_path}" in without_lpips()
+        assert "fetch them with: python -m lerobot_msdyn.models fetch alexnet, or make a file" in without_lpips()
+        assert without_lpips(tmp_path / "mine.pt") == ""
         (tmp_path / "checkpoints").mkdir()
-        (tmp_path / "checkpoints" / perceptual.ALEXNET).touch()
+        (tmp_path / "checkpoints" / perceptual.ALEXNET.file).touch()
         assert without_lpips() == ""
     for module in ("lpips", "flip_evaluator"):
         monkeypatch.setitem(sys.modules, module, None)

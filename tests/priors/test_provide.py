@@ -2,7 +2,7 @@
 
 import inspect
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -209,7 +209,8 @@ def test_every_built_in_file_registers_a_provider(kind: type[Provider]) -> None:
         assert issubclass(provider, kind), name
         assert not inspect.isabstract(provider), name
         assert provider.__module__ == f"{registry.folder}.{name}"
-        assert provider().problem(None, VIEW) != ""
+        make: Callable[..., Provider] = provider
+        assert (make("FILE") if provider.parameter else make()).problem(None, VIEW) != ""
     ranks = [provider.rank for provider in built_in.values() if provider.rank is not None]
     assert len(ranks) == len(set(ranks)) > 0
     folder = Path(inspect.getfile(provider)).parent

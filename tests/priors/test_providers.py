@@ -98,12 +98,12 @@ def test_depth_that_holds_nothing_is_named_and_auto_goes_on(view: View, caplog: 
     [
         (
             {"depth": "depth_anything"},
-            "is 'depth_anything', but .*: hf download depth-anything/Depth-Anything-V2-Small-hf$",
+            "is 'depth_anything', but .*: python -m lerobot_msdyn.models fetch depth_anything$",
         ),
-        ({"depth": "depth_anything_metric"}, "hf download depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf$"),
-        ({"masks": "sam2"}, "priors.masks is 'sam2', but .*hf download facebook/sam2.1-hiera-tiny$"),
-        ({"masks": "edgetam"}, "hf download yonigozlan/EdgeTAM-hf$"),
-        ({"tracks": "raft"}, "priors.tracks is 'raft', but RAFT's weights are not on this machine; fetch: python -c"),
+        ({"depth": "depth_anything_metric"}, "models fetch depth_anything_metric$"),
+        ({"masks": "sam2"}, "priors.masks is 'sam2', but .*models fetch sam2$"),
+        ({"masks": "edgetam"}, "models fetch edgetam$"),
+        ({"tracks": "raft"}, "'raft', but RAFT's weights are not on this machine; fetch: .*models fetch raft$"),
         ({"depth": "stereo"}, "priors.depth is 'stereo', but no other camera of the episode is read"),
         ({"depth": "absent.npz"}, "absent.npz: not a readable npz file"),
     ],

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from lerobot_msdyn.core.cameras import intrinsics_from_fov
-from lerobot_msdyn.priors.depth.table_plane import table_plane_depth
+from lerobot_msdyn.priors.depth.table_plane import table_plane
 from lerobot_msdyn.reconstruction.upright import up_of
 from lerobot_msdyn.synthetic import make_scene
 
@@ -31,7 +31,7 @@ def test_the_vertical_of_a_desk(camera: str) -> None:
 @pytest.mark.parametrize("tilt_deg", [15.0, 35.0, 70.0])
 def test_an_assumed_table_is_as_assumed(tilt_deg: float) -> None:
     intrinsics = intrinsics_from_fov(WIDTH, HEIGHT, 60.0)
-    depth = table_plane_depth(torch.zeros(1, HEIGHT, WIDTH, dtype=torch.uint8), intrinsics, 0.5, tilt_deg)[0]
+    depth = table_plane(WIDTH, HEIGHT, intrinsics, 0.5, tilt_deg)
     truth = torch.tensor([0.0, -math.cos(math.radians(tilt_deg)), -math.sin(math.radians(tilt_deg))])
     assert angle_deg(torch.tensor(up_of(depth, intrinsics, 10.0)), truth) < 0.5
 

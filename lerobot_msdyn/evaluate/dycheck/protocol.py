@@ -46,8 +46,8 @@ def evaluate_dycheck(config: DycheckConfig) -> Evaluated:
         rendered = render_validation(scene, sequence, config.out / "rgb")
         alone = render_validation(scene.without_overlay(), sequence)
     with timed(seconds, "score"):
-        missing = without_lpips()
-        network = None if missing else lpips_network()
+        missing = without_lpips(config.lpips_weights)
+        network = None if missing else lpips_network(config.lpips_weights)
         images, without = (
             {name: _score(sequence, name, picture, network) for name, picture in pictures.items()}
             for pictures in (rendered, alone)

@@ -9,7 +9,7 @@ from lerobot_msdyn.core.errors import PriorError
 _SAMPLES = 20_000  # pixels of a clip that an alignment looks at
 _STEPS = 20
 _MIN_PIXELS = 100
-_MAX_FACTOR = 2.0  # aligned depth is at most so many times the reference's largest
+MAX_FACTOR = 2.0  # aligned depth is at most so many times the reference's largest
 
 
 def align_disparity(
@@ -19,9 +19,25 @@ def align_disparity(
 ) -> Float[Tensor, "t h w"]:
     """Depth (m) of relative inverse depth, by one robust scale and shift per clip against a reference depth (m).
 
+    Depth is bounded by twice the reference's largest, which also takes care of inverse depths that come out negative.
+
+    Raises:
+        PriorError: too few pixels are known in both, or the two disagree so much that the scale is not positive.
+    """
+    scale, shift = scale_and_shift(disparity, reference, usable)
+    inverse = (scale * disparity + shift).clamp(min=1 / (MAX_FACTOR * float(reference.max())))
+    return torch.where(torch.isfinite(disparity), inverse.reciprocal(), 0.0)
+
+
+def scale_and_shift(
+    disparity: Float[Tensor, "t h w"],
+    reference: Float[Tensor, "t h w"],
+    usable: Bool[Tensor, "t h w"] | None = None,
+) -> tuple[float, float]:
+    """Those of relative inverse depth that bring it closest to a reference depth (m).
+
     Least absolute differences of inverse depth, by iterated reweighting, over the pixels where the reference is known
-    (and `usable`). Depth is bounded by twice the reference's largest, which also takes care of inverse depths that
-    come out negative.
+    (and `usable`).
 
     Raises:
         PriorError: too few pixels are known in both, or the two disagree so much that the scale is not positive.
@@ -39,8 +55,7 @@ def align_disparity(
             "relative depth contradicts the depth that it is aligned to (its nearest parts are the farthest there); "
             "affine_disparity is larger where things are nearer, see docs/priors.md"
         )
-    inverse = (scale * disparity + shift).clamp(min=1 / (_MAX_FACTOR * float(reference.max())))
-    return torch.where(torch.isfinite(disparity), inverse.reciprocal(), 0.0)
+    return scale, shift
 
 
 def align_scale(
@@ -53,9 +68,22 @@ def align_scale(
     Raises:
         PriorError: too few pixels are known in both.
     """
+    return torch.where(torch.isfinite(depth), depth, 0.0) * scale_alone(depth, reference, usable)
+
+
+def scale_alone(
+    depth: Float[Tensor, "t h w"],
+    reference: Float[Tensor, "t h w"],
+    usable: Bool[Tensor, "t h w"] | None = None,
+) -> float:
+    """The median ratio of a reference depth (m) to depth that lacks only its scale (0 = unknown).
+
+    Raises:
+        PriorError: too few pixels are known in both.
+    """
     known = torch.where(torch.isfinite(depth), depth, 0.0)
     y, x = _samples(reference, known, known > 0 if usable is None else usable & (known > 0))
-    return known * float((y / x).median())
+    return float((y / x).median())
 
 
 def _samples(

@@ -4,13 +4,13 @@ from abc import abstractmethod
 from dataclasses import replace
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from lerobot_msdyn.core.errors import PriorError
 from lerobot_msdyn.priors.depth.metres import in_metres
+from lerobot_msdyn.priors.depth.predicted import predicted
 from lerobot_msdyn.priors.exchange import AFFINE_DISPARITY, METRIC
 from lerobot_msdyn.priors.hub import LocalModel
 from lerobot_msdyn.priors.registry import Depth, DepthProvider, Estimate, Masks
@@ -41,19 +41,18 @@ class DepthAnything(DepthProvider):
         """Aligned to the best depth that needs no network, where it lacks true metres itself."""
         model = self.model(request)
 
-        def compute() -> dict[str, np.ndarray]:
-            values, metric = predict_depth(request.view.rgb, model, request.device)
-            return {"values": values.numpy().astype(np.float16), "metric": np.array(metric)}
+        def predict(rgb: UInt8[Tensor, "n h w 3"]) -> Float[Tensor, "n h w"]:
+            values, metric = predict_depth(rgb, model, request.device)
+            kind = METRIC if metric else AFFINE_DISPARITY
+            if kind != self.kind:
+                raise PriorError(
+                    f"{model.name} predicts {kind.replace('_', ' ')}; expected a model of {self.kind.replace('_', ' ')}"
+                )
+            return values
 
-        settings = {"model": model.name, "revision": model.revision}
-        arrays = request.cache.get("depth", "depth_anything", settings, compute)
-        kind = METRIC if bool(arrays["metric"]) else AFFINE_DISPARITY
-        if kind != self.kind:
-            raise PriorError(
-                f"{model.name} predicts {kind.replace('_', ' ')}; expected a model of {self.kind.replace('_', ' ')}"
-            )
-        values = torch.from_numpy(arrays["values"].astype(np.float32))
-        estimate = in_metres(request, instances, values, kind, trusted=False)
+        settings = {"model": model.name, "revision": model.revision, "kind": self.kind}
+        values, elsewhere = predicted(request, "depth_anything", settings, predict)
+        estimate = in_metres(request, instances, values, self.kind, trusted=False, elsewhere=elsewhere)
         return replace(estimate, model=model)
 
 

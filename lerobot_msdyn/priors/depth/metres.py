@@ -8,6 +8,7 @@ from lerobot_msdyn.core.observations import DepthTraits, Origin
 from lerobot_msdyn.priors.depth.align import align_disparity, align_scale
 from lerobot_msdyn.priors.depth.blurred_edges import sharpened
 from lerobot_msdyn.priors.depth.flying_pixels import without_flying_pixels
+from lerobot_msdyn.priors.depth.fuse import fused
 from lerobot_msdyn.priors.exchange import AFFINE_DISPARITY, METRIC
 from lerobot_msdyn.priors.provide import best
 from lerobot_msdyn.priors.registry import Depth, DepthProvider, Estimate, Masks
@@ -15,9 +16,17 @@ from lerobot_msdyn.priors.request import Request
 
 
 def in_metres(
-    request: Request, instances: Masks, values: Float[Tensor, "t h w"], kind: str, *, trusted: bool
+    request: Request,
+    instances: Masks,
+    values: Float[Tensor, "t h w"],
+    kind: str,
+    *,
+    trusted: bool,
+    elsewhere: Float[Tensor, "m h w"] | None = None,
 ) -> Estimate[Depth]:
     """Depth without blurred edges: what is near a surface is put on it, and what floats becomes unknown.
+
+    Before a fixed camera, depth whose reference is a ground is put together with it (`priors.depth.fuse`).
 
     Args:
         request: the video; other depth of it is the reference.
@@ -27,6 +36,7 @@ def in_metres(
             shift, larger = nearer).
         trusted: whether metres are true ones. Those of a network are those of an unknown focal length: a reference in
             true metres corrects them where there is one.
+        elsewhere: what was predicted of frames of all episodes of this camera.
 
     Raises:
         PriorError: the values cannot be aligned to the reference.
@@ -36,13 +46,24 @@ def in_metres(
         return _clean(z, True, "in metres")
     reference, origin = reference_depth(request, instances)
     true_metres = reference.traits.metric
-    usable = None if reference.traits.measured else instances == 0
-    if kind == AFFINE_DISPARITY:
-        aligned = align_disparity(values, reference.z, usable)
-        return _clean(aligned, true_metres, f"scaled and shifted to {origin.provider}")
     if kind == METRIC and not true_metres:
         return _clean(values, False, "in the network's own metres")
-    return _clean(align_scale(values, reference.z, usable), true_metres, f"scaled to {origin.provider}")
+    how = f"scaled{' and shifted' if kind == AFFINE_DISPARITY else ''} to {origin.provider}"
+    if reference.ground is not None and request.view.camera.is_static:
+        beyond = None if elsewhere is None else _inverse(elsewhere, kind)
+        z = fused(
+            _inverse(values, kind),
+            instances,
+            reference.ground,
+            reference.z,
+            beyond,
+            shifted=kind == AFFINE_DISPARITY,
+            known=not reference.traits.assumed,
+        )
+        return _clean(z, true_metres, how)
+    usable = None if reference.traits.measured else instances == 0
+    align = align_disparity if kind == AFFINE_DISPARITY else align_scale
+    return _clean(align(values, reference.z, usable), true_metres, how)
 
 
 def reference_depth(request: Request, instances: Masks) -> tuple[Depth, Origin]:
@@ -53,6 +74,11 @@ def reference_depth(request: Request, instances: Masks) -> tuple[Depth, Origin]:
         lambda provider: provider.estimate(request, instances),
         among=lambda provider: provider.is_reference,
     )
+
+
+def _inverse(values: Float[Tensor, "n h w"], kind: str) -> Float[Tensor, "n h w"]:
+    """Inverse depth, up to what its kind lacks; not finite = unknown."""
+    return values if kind == AFFINE_DISPARITY else torch.where(values > 0, values, torch.nan).reciprocal()
 
 
 def _clean(z: Float[Tensor, "t h w"], true_metres: bool, how: str) -> Estimate[Depth]:

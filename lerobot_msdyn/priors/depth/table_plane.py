@@ -11,44 +11,43 @@ from torch import Tensor
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.geometry import unproject_image
 
+type Ground = Float[Tensor, "h w"]
+
 _WALL = 3.0  # distance of the wall behind the table, in distances to the table at the image's centre
 _LOWEST = 0.98  # quantile of an instance's rows where it touches the table; the very last ones may be stray pixels
 _SMOOTH_FRAMES = 9  # of the temporal smoothing of an instance's distance
 
 
-def table_plane_depth(
-    instances: UInt8[Tensor, "t h w"], intrinsics: Float[Tensor, "3 3"], height_m: float, tilt_deg: float
-) -> Float[Tensor, "t h w"]:
-    """Assumed z-depth (m) where none is recorded: a table, a wall behind it, and upright things on the table.
+def table_plane(width: int, height: int, intrinsics: Float[Tensor, "3 3"], height_m: float, tilt_deg: float) -> Ground:
+    """Assumed z-depth (m) where none is recorded: a table, and a wall behind it.
 
-    The camera looks `tilt_deg` below the horizontal from `height_m` above the table, without roll. A moving instance
-    has one depth per frame, that of the table under its lowest rows, smoothed over time. Plausible, not metric: what
-    is lifted off the table, or hides its own foot, is put too far away or too near.
+    The camera looks `tilt_deg` below the horizontal from `height_m` above the table, without roll.
     """
-    _, height, width = instances.shape
     tilt = math.radians(tilt_deg)
     y = (torch.arange(height) + 0.5 - intrinsics[1, 2].cpu()) / intrinsics[1, 1].cpu()
     descent = y * math.cos(tilt) + math.sin(tilt)  # of a ray, per metre of z
     wall = _WALL * height_m / math.sin(tilt)
     rows = torch.where(descent > height_m / wall, height_m / descent.clamp(min=1e-6), wall)
-    return _with_standing(rows[:, None].repeat(1, width), instances)
+    return rows[:, None].repeat(1, width)
 
 
-def ground_depth(instances: UInt8[Tensor, "t h w"], camera: CameraTrack, ground_m: float) -> Float[Tensor, "t h w"]:
-    """As `table_plane_depth`, for a fixed camera that is known to stand over the ground (z up, m)."""
-    _, height, width = instances.shape
+def ground_plane(camera: CameraTrack, ground_m: float) -> Ground:
+    """As `table_plane`, for a fixed camera that is known to stand over the ground (z up, m)."""
     pose = camera.world_from_camera[0]
-    rays = unproject_image(torch.ones(height, width), camera.intrinsics[0])
+    rays = unproject_image(torch.ones(camera.height, camera.width), camera.intrinsics[0])
     descent = -(rays @ pose[2, :3])  # per metre of z
     above = (pose[2, 3] - ground_m).clamp(min=1e-3)
-    centre = descent[height // 2, width // 2].clamp(min=0.1)
+    centre = descent[camera.height // 2, camera.width // 2].clamp(min=0.1)
     wall = _WALL * above / centre
-    ground = torch.where(descent > above / wall, above / descent.clamp(min=1e-6), wall)
-    return _with_standing(ground, instances)
+    return torch.where(descent > above / wall, above / descent.clamp(min=1e-6), wall)
 
 
-def _with_standing(ground: Float[Tensor, "h w"], instances: UInt8[Tensor, "t h w"]) -> Float[Tensor, "t h w"]:
-    """Depth of the ground, and of the things that stand on it."""
+def with_standing(ground: Ground, instances: UInt8[Tensor, "t h w"]) -> Float[Tensor, "t h w"]:
+    """z-depth (m) of the ground, and of upright things on it.
+
+    A moving instance has one depth per frame, that of the ground under its lowest rows, smoothed over time. Plausible,
+    not metric: what is lifted, or hides its own foot, is put too far away or too near.
+    """
     depth, rows = ground.repeat(len(instances), 1, 1), ground.median(dim=1).values
     for instance in range(1, int(instances.max()) + 1):
         mask = instances == instance

@@ -10,12 +10,12 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from lerobot_msdyn.core.errors import PriorError
-from lerobot_msdyn.priors.hub import LocalModel, demand_library
+from lerobot_msdyn.priors.hub import LocalModel, checkpoint, demand_library
+from lerobot_msdyn.priors.models import MODELS, how_to_fetch
 from lerobot_msdyn.priors.registry import Unusable
 
 _NAME = "torchvision raft_small"
-_LICENCE = "BSD-3-Clause"
-_FETCH = "python -c \"from torchvision.models.optical_flow import raft_small; raft_small(weights='C_T_V2')\""
+_MODEL = MODELS["raft"]
 _MIN_SIDE, _MULTIPLE = 128, 8  # px: RAFT takes no smaller images, and sides that are multiples
 _UPDATES = 12
 
@@ -30,14 +30,11 @@ def raft_weights(weights: Path | None) -> LocalModel:
     if weights is not None:
         if not weights.is_file():
             raise Unusable(f"there is no {weights}", "priors.raft_weights names it")
-        return LocalModel(_NAME, "local", _LICENCE, weights)
-    from torchvision.models.optical_flow import Raft_Small_Weights
-
-    name = Path(Raft_Small_Weights.C_T_V2.url).name
-    path = Path(torch.hub.get_dir()) / "checkpoints" / name
+        return LocalModel(_NAME, "local", _MODEL.licence, weights)
+    path = checkpoint(_MODEL.file)
     if not path.is_file():
-        raise Unusable("RAFT's weights are not on this machine", f"fetch: {_FETCH}")
-    return LocalModel(_NAME, path.stem, _LICENCE, path)
+        raise Unusable("RAFT's weights are not on this machine", f"fetch: {how_to_fetch(_MODEL.place)}")
+    return LocalModel(_NAME, path.stem, _MODEL.licence, path)
 
 
 class RaftFlow:

@@ -28,14 +28,19 @@ def torch_on_one_thread() -> Iterator[None]:
     Thousands of small tensor operations are slower when torch spreads each over all cores, many times slower where
     other programs want these too: its threads wait for each other without letting go of their core.
     """
-    threads = torch.get_num_threads()
-    token = _threads.set(_threads.get() or threads)
+    before = torch.get_num_threads()
+    token = _threads.set(threads())
     torch.set_num_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(threads)
+        torch.set_num_threads(before)
         _threads.reset(token)
+
+
+def threads() -> int:
+    """How many threads this process may use for something that runs for longer than a small tensor operation."""
+    return _threads.get() or torch.get_num_threads()
 
 
 @cache
@@ -51,7 +56,7 @@ if hasattr(os, "register_at_fork"):
 def run(kernel: Callable[..., None], items: int, *arguments: Any) -> None:
     """Call `kernel(tickets, *arguments)` on as many threads as torch uses and `items` tickets can feed."""
     tickets = np.zeros(1, np.int64)
-    helpers = min(_threads.get() or torch.get_num_threads(), items) - 1
+    helpers = min(threads(), items) - 1
     futures = [_pool().submit(kernel, tickets, *arguments) for _ in range(helpers)]
     kernel(tickets, *arguments)
     for future in futures:

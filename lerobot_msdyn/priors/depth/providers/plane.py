@@ -1,7 +1,7 @@
 """Depth without a sensor or learned weights: everything stands on a table."""
 
 from lerobot_msdyn.core.observations import DepthTraits
-from lerobot_msdyn.priors.depth.table_plane import ground_depth, table_plane_depth
+from lerobot_msdyn.priors.depth.table_plane import ground_plane, table_plane, with_standing
 from lerobot_msdyn.priors.registry import DEPTH, Depth, DepthProvider, Estimate, Masks
 from lerobot_msdyn.priors.request import Request
 from lerobot_msdyn.priors.robot import RELATIVE_ERROR
@@ -20,11 +20,15 @@ class Plane(DepthProvider):
 
     def estimate(self, request: Request, instances: Masks) -> Estimate[Depth]:
         """Assumed, not measured, but where a robot stands on the table."""
-        if request.view.robot is not None:
-            z = ground_depth(instances, request.view.camera, request.view.robot.ground_m)
+        view = request.view
+        if view.robot is not None:
+            ground = ground_plane(view.camera, view.robot.ground_m)
             traits = DepthTraits(metric=True, relative_error=RELATIVE_ERROR)
-            return Estimate(Depth(z, traits), "the table that the robot stands on")
-        height_m, tilt_deg = request.camera.height_m, request.camera.tilt_deg
-        z = table_plane_depth(instances, request.view.camera.intrinsics[0], height_m, tilt_deg)
-        traits = DepthTraits(sharp=True, relative_error=0.10, assumed=True)
-        return Estimate(Depth(z, traits), f"a table seen from {height_m:g} m at {tilt_deg:g} degrees")
+            how = "the table that the robot stands on"
+        else:
+            height_m, tilt_deg = request.camera.height_m, request.camera.tilt_deg
+            width, height = view.camera.width, view.camera.height
+            ground = table_plane(width, height, view.camera.intrinsics[0], height_m, tilt_deg)
+            traits = DepthTraits(sharp=True, relative_error=0.10, assumed=True)
+            how = f"a table seen from {height_m:g} m at {tilt_deg:g} degrees"
+        return Estimate(Depth(with_standing(ground, instances), traits, ground), how)

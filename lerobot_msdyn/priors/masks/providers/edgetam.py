@@ -2,11 +2,12 @@
 
 from lerobot_msdyn.priors.hub import LocalModel, local_model
 from lerobot_msdyn.priors.masks.prompted import PromptedMasks
+from lerobot_msdyn.priors.models import MODELS
 from lerobot_msdyn.priors.registry import MASKS
 from lerobot_msdyn.priors.request import Request
 
 # transformers builds EdgeTAM's default configuration when it loads a model, and reads this one's for it.
-BACKBONE = "timm/repvit_m1.dist_in1k"
+BACKBONE = MODELS["edgetam"].companion
 
 
 @MASKS.register("edgetam")
