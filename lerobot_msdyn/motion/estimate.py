@@ -104,9 +104,9 @@ def motion_from_tracks(tracks: LiftedTracks, config: MotionConfig, recording: Re
     if len(config.levels) > 1:
         left = _left_by(first, levels[0], given, tracks.valid)
         motion = _with_finer_levels(motion, left, tracks, config, given.noise, by_video)
-    if recording is None:
-        return motion
-    return recording.guided(replace(registered, names=motion.names, levels=motion.levels))
+    if recording is not None:
+        motion = recording.guided(replace(registered, names=motion.names, levels=motion.levels))
+    return replace(motion, blend_parts=config.blend_parts, blend_reach=config.blend_reach)
 
 
 def _with_finer_levels(
