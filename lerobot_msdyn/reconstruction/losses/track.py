@@ -48,7 +48,7 @@ def track_loss(step: FitStep, frame: int, times: Int[Tensor, " b"]) -> Float[Ten
     sure = tracks.confidence[rows, frame] * tracks.confidence[rows][:, times].T * nearness[:, None]
     counts = tracks.visible[rows][:, times].T & (places[:, -1] > LEAST_ALPHA) & (depth > 1e-6 * targets.distance)
     off = (xy - aim).abs().sum(-1) / max(camera.width, camera.height)
-    column, row = nearest_pixel(aim, camera.width, camera.height)
+    row, column = nearest_pixel(aim, camera.width, camera.height)
     seen = targets.priors.depth[times[:, None], row, column]
     inverse = (1 / depth.where(counts, 1) - 1 / seen.where(seen > 0, 1)).abs() * targets.distance
     loss = _trimmed_mean(off[counts], sure[counts])
