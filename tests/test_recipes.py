@@ -10,7 +10,7 @@ from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.recipes import run
 
 PROJECT = Path(__file__).parent.parent
-NAMES = ["balanced", "best", "multi_camera", "quick", "rgbd", "so101_front"]
+NAMES = ["balanced", "best", "multi_camera", "paper", "quick", "rgbd", "so101_front"]
 
 
 def test_ls_names_every_recipe_with_its_purpose(capsys: pytest.CaptureFixture[str]) -> None:

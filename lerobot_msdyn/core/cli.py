@@ -38,8 +38,10 @@ def load_recipe(name: str) -> Recipe:
     return parse_config(Recipe, ["--recipe", name], {}, command="load_recipe")
 
 
-def parse_config[T](config_class: type[T], arguments: list[str], aliases: Mapping[str, str], *, command: str) -> T:
-    """The config that a command line describes: defaults, then `--recipe`, then the other flags.
+def parse_config[T](
+    config_class: type[T], arguments: list[str], aliases: Mapping[str, str], *, command: str, recipe: str | None = None
+) -> T:
+    """The config that a command line describes: defaults, then `--recipe` (or `recipe`), then the other flags.
 
     Prints the help and exits on `-h` or `--help`.
 
@@ -51,9 +53,10 @@ def parse_config[T](config_class: type[T], arguments: list[str], aliases: Mappin
         with contextlib.suppress(ConfigError):  # help is also for those whose flags are wrong
             plugins = _split_flags([item for item in arguments if item not in ("-h", "--help")], aliases)[1]
         import_plugins(plugins)
-        sys.stdout.write(format_help(config_class, aliases, command))
+        sys.stdout.write(format_help(config_class, aliases, command, recipe))
         sys.exit(EXIT_OK)
-    recipe, plugins, overrides = _split_flags(arguments, aliases)
+    named, plugins, overrides = _split_flags(arguments, aliases)
+    recipe = named if named is not None else recipe
     import_plugins(plugins)
     content: dict[str, Any] = draccus.encode(config_class())
     for part in ([read_recipe(recipe)] if recipe is not None else []) + [overrides]:
@@ -72,13 +75,14 @@ def parse_config[T](config_class: type[T], arguments: list[str], aliases: Mappin
     return typing.cast(T, config)
 
 
-def format_help(config_class: type, aliases: Mapping[str, str], command: str) -> str:
+def format_help(config_class: type, aliases: Mapping[str, str], command: str, recipe: str | None = None) -> str:
     """The help text of a command: every field with its default and the comment that stands above it."""
     names = ", ".join(f"--{alias} for --{name}" for alias, name in aliases.items())
     recipes = ", ".join(path.stem for path in packaged_recipes())
+    without = "" if recipe is None else f" (default: {recipe})"
     head = (
         f"usage: {command} [--field value ...]\n\n{inspect.getdoc(config_class)}\n\n"
-        f"  --recipe NAME_OR_FILE\n      A YAML file with any of the fields below, read before the flags; "
+        f"  --recipe NAME_OR_FILE{without}\n      A YAML file with any of the fields below, read before the flags; "
         f"by name: {recipes}.\n  --plugins MODULE_OR_FILE.py\n      Your own providers, motion levels, perturbations "
         f"or loss terms, imported before the recipe is read (docs/extending.md).\n\nShort names: {names}.\n"
         "Exit codes: 0 done, or finished before; 1 some episodes or views were left out; 2 bad input; "

@@ -7,7 +7,7 @@ import torch
 from lerobot_msdyn.core.cameras import CameraTrack, intrinsics_from_fov
 from lerobot_msdyn.core.geometry import axis_angle_to_matrix, project, se3
 from lerobot_msdyn.core.observations import View
-from lerobot_msdyn.motion.model.bases import level_from_motions
+from lerobot_msdyn.motion.model.bases import MotionLevel, level_from_motions
 from lerobot_msdyn.priors import PointTracks, Priors
 from lerobot_msdyn.reconstruction.loss_terms import FitStep, Targets
 from lerobot_msdyn.scene.dynamic import DynamicScene
@@ -56,6 +56,29 @@ def targets_of(scene: DynamicScene) -> Targets:
     )
     priors = Priors(depth, moves.to(torch.uint8), tracks)
     return Targets(View(rgb, camera), priors, moves, torch.ones_like(moves), 1.0)
+
+
+def in_single(scene: DynamicScene) -> DynamicScene:
+    """The same in the precision of a fit."""
+    level = scene.levels[0]
+    assert isinstance(level, MotionLevel)
+    floats = ("rotations_6d", "displacements", "knots", "pivots", "reach")
+    static, moving = (
+        Gaussians(**{item.name: getattr(part, item.name).float() for item in fields(part)})
+        for part in (scene.static, scene.moving)
+    )
+    level = replace(level, **{name: getattr(level, name).float() for name in floats})
+    logits = tuple(logit.float() for logit in scene.logits)
+    return replace(scene, static=static, moving=moving, levels=(level,), logits=logits)
+
+
+def recorded_in_single(scene: DynamicScene) -> tuple[View, Priors]:
+    """What `targets_of` has, in the precision of a fit."""
+    targets = targets_of(scene)
+    camera, priors = targets.view.camera, targets.priors
+    camera = replace(camera, intrinsics=camera.intrinsics.float(), world_from_camera=camera.world_from_camera.float())
+    tracks = replace(priors.tracks, xy=priors.tracks.xy.float(), confidence=priors.tracks.confidence.float())
+    return View(targets.view.rgb, camera), replace(priors, depth=priors.depth.float(), tracks=tracks)
 
 
 def at_frame(scene: DynamicScene, frame: int, targets: Targets) -> FitStep:
