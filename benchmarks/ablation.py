@@ -63,7 +63,7 @@ TRACKS = {"gate": False, "register": False}  # levels are fitted to the tracks, 
 PAPER = TRACKS | {"max_parts": 1}  # and an object is an instance
 
 
-LEARNED = {"learn": LearnConfig(bases=True, begin=0)}
+LEARNED = {"learn": LearnConfig(bases=True, begin=0.0)}
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Row:
     scene: dict[str, Any] = field(default_factory=dict)
     weights: dict[str, float] = field(default_factory=dict)
     fit: dict[str, Any] = field(default_factory=dict)
-    field: str = ""  # whether a deformation field takes part in the fit: "on" from the tracks' motion, "afresh"
+    deformation: str = ""  # whether a deformation field takes part in the fit: "on" from the tracks' motion, "afresh"
     recipe: str = ""  # what is changed; none: the default
 
 
@@ -93,8 +93,8 @@ ROWS = (
     Row("flat 10", TRACKS | {"levels": ["flat"]}),
     Row("flat 10, learned", TRACKS | {"levels": ["flat"]}, fit=LEARNED),
     Row("field", TRACKS | {"levels": ["field"]}),
-    Row("field, learned", TRACKS | {"levels": ["field"]}, field="on"),
-    Row("field, learned afresh", TRACKS | {"levels": ["field"]}, field="afresh"),
+    Row("field, learned", TRACKS | {"levels": ["field"]}, deformation="on"),
+    Row("field, learned afresh", TRACKS | {"levels": ["field"]}, deformation="afresh"),
     Row("L1 of parts", TRACKS | {"levels": ["object"]}),
     Row("L1-L3 of parts", TRACKS | {"levels": ALL}),
     Row("the method: registered, gated", {"levels": ALL}),
@@ -116,7 +116,7 @@ PAPER_ROWS = (
     paper("L1-L3"),
     paper("L4", motion={"levels": [*ALL, "particle"]}),
     paper("L1-L3, hard objects", motion={"blend_parts": 1}),
-    paper("L1-L3, bases learned alone", fit={"learn": LearnConfig(bases=True, begin=0)}),
+    paper("L1-L3, bases learned alone", fit={"learn": LearnConfig(bases=True, begin=0.0)}),
     paper("L1-L3, not learned", fit={"learn": LearnConfig()}),
     paper("L1-L3, rgb only", weights=dict.fromkeys(OTHERS, 0.0)),
     *(paper(f"L1-L3, without {loss}", weights={loss: 0.0}) for loss in OTHERS),
@@ -178,8 +178,8 @@ def reconstructed(prepared: Prepared, row: Row, recipe: Recipe) -> Reconstructio
     def fitted(draft: Draft) -> None:
         scene = draft.scene
         learned: list[dict[str, Any]] = []
-        if row.field:
-            scene, learned = with_learned_field(scene, afresh=row.field == "afresh")
+        if row.deformation:
+            scene, learned = with_learned_field(scene, afresh=row.deformation == "afresh")
         draft.fitted = fit(
             scene,
             draft.view,

@@ -1,4 +1,4 @@
-"""What the ablation compares with that the library does not have: pictures warped by depth, and a field that is learned."""
+"""What the ablation compares with that the library lacks: pictures warped by depth, and a field that is learned."""
 
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass, replace

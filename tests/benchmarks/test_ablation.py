@@ -86,7 +86,7 @@ def test_motion_that_is_learned_changes_in_the_fit_and_is_fixed_afterwards(ablat
         row = next(row for row in ablation.ROWS if row.name == name)
         scenes = [
             ablation.reconstructed(prepared, one, ablation.recipe_of(one, settings, 0)).windows[0].scene
-            for one in (replace(row, field="", fit={}), row)
+            for one in (replace(row, deformation="", fit={}), row)
         ]
         fixed, learned = (getattr(scene.levels[0], tensor) for scene in scenes)
         assert not learned.requires_grad
