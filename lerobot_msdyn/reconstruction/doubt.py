@@ -16,6 +16,7 @@ from lerobot_msdyn.core.geometry import (
 )
 from lerobot_msdyn.core.observations import PointTracks
 from lerobot_msdyn.core.sampling import REFERENCE_WIDTH, evenly
+from lerobot_msdyn.motion.model.bases import MotionLevel
 from lerobot_msdyn.motion.model.compose import compose
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.scene.dynamic import DynamicScene
@@ -38,7 +39,7 @@ def doubts(scene: DynamicScene, camera: CameraTrack, priors: Priors, sure_px: fl
         priors: tracks and depth, at the camera's size.
         sure_px: of pictures 320 wide.
     """
-    counts = [int(getattr(level, "active", torch.zeros(0)).numel()) for level in scene.levels]
+    counts = [len(level) if isinstance(level, MotionLevel) else 0 for level in scene.levels]
     if sure_px == 0:
         return [torch.ones(count) for count in counts]
     shares = [torch.zeros(count) for count in counts]

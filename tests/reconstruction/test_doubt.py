@@ -3,8 +3,10 @@
 from dataclasses import replace
 
 import torch
+from motion_levels import of_bases
 from moving_cards import FRAMES, moving_cards, targets_of
 
+from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.observations import PointTracks
 from lerobot_msdyn.core.sampling import REFERENCE_WIDTH
 from lerobot_msdyn.priors import Priors
@@ -12,12 +14,12 @@ from lerobot_msdyn.reconstruction.doubt import doubts, track_errors_px
 from lerobot_msdyn.scene.dynamic import DynamicScene
 
 
-def case(shift_m: float) -> tuple[DynamicScene, object, Priors]:
+def case(shift_m: float) -> tuple[DynamicScene, CameraTrack, Priors]:
     """Tracks of both cards, from the second of which a scene goes away by `shift_m` a frame."""
     truth = moving_cards(part_alone=True)
     targets = targets_of(truth)
     plain = replace(targets.priors, depth=torch.full_like(targets.priors.depth, 1.01))
-    level = truth.levels[0]
+    (level,) = of_bases(truth.levels)
     off = level.displacements.clone()
     off[1, :, 0] += shift_m * torch.arange(FRAMES)
     scene = replace(truth, levels=(replace(level, displacements=off),))

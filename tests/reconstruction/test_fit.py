@@ -98,7 +98,7 @@ def test_each_part_of_the_papers_fit_is_one_switch_away_and_changes_the_result(f
         for name, tensor in with_it.items()
     )
     assert all(bool(tensor.float().isfinite().all()) for tensor in with_it.values())
-    assert torch.equal(without["levels.0.displacements"], scene.levels[0].displacements)
+    assert torch.equal(without["levels.0.displacements"], of_bases(scene.levels)[0].displacements)
     assert torch.equal(without["levels.0.logits"], scene.logits[0])
 
 

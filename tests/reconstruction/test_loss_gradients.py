@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from motion_levels import of_bases
 from moving_cards import at_frame, moving_cards, targets_of
 from torch import Tensor
 
@@ -19,7 +20,7 @@ TERMS = ["rgb", "mask", "depth", "ssim", "track", "rigidity"]
 
 
 def leaves_of(scene: DynamicScene) -> dict[str, Tensor]:
-    level = scene.levels[0]
+    (level,) = of_bases(scene.levels)
     return {
         "static colours": scene.static.sh,
         "static means": scene.static.means,
@@ -33,7 +34,8 @@ def leaves_of(scene: DynamicScene) -> dict[str, Tensor]:
 
 
 def with_leaves(scene: DynamicScene, leaves: dict[str, Tensor]) -> DynamicScene:
-    level = replace(scene.levels[0], rotations_6d=leaves["turns"], displacements=leaves["shifts"])
+    (level,) = of_bases(scene.levels)
+    level = replace(level, rotations_6d=leaves["turns"], displacements=leaves["shifts"])
     return replace(
         scene,
         static=replace(scene.static, sh=leaves["static colours"], means=leaves["static means"]),
@@ -90,7 +92,7 @@ def test_the_track_loss_is_zero_where_points_are_carried_to_their_tracks_and_gro
     scene = moving_cards(part_alone=True)
     targets = targets_of(scene)
     right = float(LOSSES.get("track")(at_frame(scene, FRAME, targets)))
-    level = scene.levels[0]
+    (level,) = of_bases(scene.levels)
     off = level.displacements.clone()
     off[:, [0, 2, 3]] += torch.tensor([0.4, 0.0, 0.0], dtype=off.dtype)
     wrong = replace(scene, levels=(replace(level, displacements=off),))

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import torch
+from motion_levels import of_bases
 from moving_cards import FRAMES, moving_cards
 from torch import Tensor
 
@@ -29,7 +30,7 @@ def stepped(parameters: Parameters, steps: int = 3) -> DynamicScene:
 
 
 def carried(scene: DynamicScene, frame: int) -> Tensor:
-    return level_affines(scene.levels[0], torch.tensor([frame]))
+    return level_affines(of_bases(scene.levels)[0], torch.tensor([frame]))
 
 
 def test_motion_stays_where_it_is_not_learned_or_has_not_begun() -> None:
@@ -67,7 +68,7 @@ def test_another_canonical_frame_stays_as_well() -> None:
 
 def test_a_basis_without_doubt_and_an_inactive_one_are_left_alone() -> None:
     scene = moving_cards()
-    level = scene.levels[0]
+    (level,) = of_bases(scene.levels)
     inactive = replace(scene, levels=(replace(level, active=torch.tensor([True, False])),))
     for given, doubt in ((scene, [torch.tensor([1.0, 0.0])]), (inactive, [])):
         parameters = Parameters(given, config(bases=True), 1.0, doubt)
@@ -84,7 +85,7 @@ def test_the_rate_of_a_basis_goes_with_its_doubt() -> None:
         parameters = Parameters(scene, config(bases=True), 1.0, [torch.full((2,), doubt)])
         parameters.begin_motion()
         after = stepped(parameters, 1)
-        shifts.append((after.levels[0].displacements - scene.levels[0].displacements).abs().max())
+        shifts.append((of_bases(after.levels)[0].displacements - of_bases(scene.levels)[0].displacements).abs().max())
     torch.testing.assert_close(shifts[1], shifts[0] / 4, rtol=1e-3, atol=0)
 
 
