@@ -102,7 +102,7 @@ def fit(
             parameters.begin_motion()
         scene = parameters.scene
         if step == int(config.moving_gain_from * config.steps) and len(scene.moving) > 0:
-            parameters.shade(_with_moving_gain(scene, view, priors, backend))
+            parameters.shade(_measured_shading(scene, view, priors, backend))
             scene = parameters.scene
         frames = next(order).to(scene.device)
         camera = targets.view.camera.select(frames)
@@ -176,7 +176,8 @@ def _check(loss: Float[Tensor, ""], step: int, frames: Int[Tensor, "1"]) -> None
         )
 
 
-def _with_moving_gain(scene: DynamicScene, view: View, priors: Priors, backend: str) -> Shading:
+def _measured_shading(scene: DynamicScene, view: View, priors: Priors, backend: str) -> Shading:
+    """The scene's brightness over time, that of the moving set as it is measured now."""
     shading = scene.shading or to_device(no_shading(len(scene.static), len(scene.moving), scene.frames), scene.device)
     gain = moving_gain(scene, view, priors, backend).to(scene.device)
     return replace(shading, moving=gain)
