@@ -1,4 +1,4 @@
-"""Where the scene carries what it shows at a tracked pixel, against where the track is (the paper's L_track).
+"""Where the scene carries what it shows at a tracked pixel, against where the track goes (the paper's L_track).
 
 The form is that of Shape of Motion (Wang et al. 2024, section 3.4): positions at other times are rendered at the frame.
 """
@@ -31,29 +31,37 @@ def track(step: FitStep) -> Float[Tensor, ""]:
 def track_loss(step: FitStep, frame: int, times: Int[Tensor, " b"]) -> Float[Tensor, ""]:
     """Weighted mean distance, in shares of the picture's longer side, and a tenth of that of inverse depths.
 
-    Tracks count where they are seen at both times, by their confidences and exp(-2 |dt| / T).
+    What is compared is by how much a point goes from the frame to the other times. Where it is at the frame is off by
+    up to a Gaussian: on a slanted surface nearer Gaussians hide those behind them, and blended positions lie towards
+    the camera. Tracks count where they are seen at both times, by their confidences and exp(-2 |dt| / T).
     """
     scene, targets = step.scene, step.targets
     tracks, camera = targets.priors.tracks, targets.view.camera
     rows = tracks.visible[:, frame].nonzero()[:, 0]
     if len(rows) == 0 or len(scene.moving) == 0:
         return scene.moving.means.sum() * 0
-    positions, alpha = render_positions(scene, camera.select([frame]), frame, times, step.backend)
-    start = tracks.xy[rows, frame]
-    places = _sampled(torch.cat((positions.flatten(2), alpha[..., None]), -1), start)
-    carried = places[:, :-1].unflatten(-1, (len(times), 3)).transpose(0, 1)
-    xy, depth = project(transform_points(camera.camera_from_world[times], carried), camera.intrinsics[times])
-    aim = tracks.xy[rows][:, times].transpose(0, 1)
+    both = torch.cat((times.new_tensor([frame]), times))
+    positions, alpha = render_positions(scene, camera.select([frame]), frame, both, step.backend)
+    places = _sampled(torch.cat((positions.flatten(2), alpha[..., None]), -1), tracks.xy[rows, frame])
+    carried = places[:, :-1].unflatten(-1, (len(both), 3)).transpose(0, 1)
+    xy, depth = project(transform_points(camera.camera_from_world[both], carried), camera.intrinsics[both])
+    tracked = tracks.xy[rows][:, both].transpose(0, 1)
     nearness = torch.exp(-2 * (times - frame).abs() / scene.frames)
     sure = tracks.confidence[rows, frame] * tracks.confidence[rows][:, times].T * nearness[:, None]
-    counts = tracks.visible[rows][:, times].T & (places[:, -1] > LEAST_ALPHA) & (depth > 1e-6 * targets.distance)
-    off = (xy - aim).abs().sum(-1) / max(camera.width, camera.height)
-    row, column = nearest_pixel(aim, camera.width, camera.height)
-    seen = targets.priors.depth[times[:, None], row, column]
-    inverse = (1 / depth.where(counts, 1) - 1 / seen.where(seen > 0, 1)).abs() * targets.distance
-    loss = _trimmed_mean(off[counts], sure[counts])
-    known = counts & (seen > 0)
-    return loss + DEPTH_WEIGHT * _trimmed_mean(inverse[known], sure[known])
+    drawn = (places[:, -1] > LEAST_ALPHA) & (depth > 1e-6 * targets.distance).all(0)
+    counts = tracks.visible[rows][:, times].T & drawn
+    off = (_gone(xy) - _gone(tracked)).abs().sum(-1) / max(camera.width, camera.height)
+    row, column = nearest_pixel(tracked, camera.width, camera.height)
+    seen = targets.priors.depth[both[:, None], row, column]
+    inverse = _gone(1 / depth.where(drawn, 1)) - _gone(1 / seen.where(seen > 0, 1))
+    known = counts & (seen[1:] > 0) & (seen[0] > 0)
+    by_depth = _trimmed_mean((inverse * targets.distance).abs()[known], sure[known])
+    return _trimmed_mean(off[counts], sure[counts]) + DEPTH_WEIGHT * by_depth
+
+
+def _gone(values: Float[Tensor, "s *any"]) -> Float[Tensor, "b *any"]:
+    """From the first time to the others."""
+    return values[1:] - values[:1]
 
 
 def _sampled(image: Float[Tensor, "h w c"], xy: Float[Tensor, "n 2"]) -> Float[Tensor, "n c"]:
