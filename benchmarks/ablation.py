@@ -2,6 +2,7 @@
 
     python benchmarks/ablation.py [--kinds all,sheet,push,lid] [--seeds 0,1,2] [--sim FOLDER --scenes A,B] [--json FILE]
     python benchmarks/ablation.py --true_priors --rows "L1;L1-L3" [...]
+    python benchmarks/ablation.py --rows paper --width 320 --steps 2000 --sim FOLDER --sim_seeds 0,1,2 --json PAPER.json
     python benchmarks/ablation.py --report
 
 Every row is fitted to the same videos with the same priors (recorded depth, the project's own masks and tracks, or the
@@ -18,6 +19,9 @@ are fitted to the tracks and kept. `of parts`: an instance is split into rigid p
 package does: parts registered to the video, finer levels only where they prove themselves. `rgb only`: without the
 losses of depth and mask. `flat 10`: Shape of Motion's model; `field`: Deformable 3D Gaussians' (rivals/); both fitted
 to the tracks. `learned`: motion takes part in the fit; `afresh`: from none at all.
+
+`paper: ...` are the recipe `paper` (the paper's method whole: docs/reconstruction.md), with one thing changed each;
+`--rows paper` is all of them.
 """
 
 import argparse
@@ -34,12 +38,13 @@ import numpy as np
 import rivals
 import torch
 from ablation_report import overview_table, plot, scene_table
-from ablation_rivals import warped_pictures, with_fixed_motion, with_learned_motion
+from ablation_rivals import warped_pictures, with_fixed_field, with_learned_field
 from ablation_scenes import Case, HeldOut, simulated_case, synthetic_case
 from jaxtyping import UInt8
 from numpy import ndarray
 
-from lerobot_msdyn.core.config import Recipe
+from lerobot_msdyn.core.cli import load_recipe
+from lerobot_msdyn.core.config import DensityConfig, LearnConfig, Recipe
 from lerobot_msdyn.core.files import write_whole
 from lerobot_msdyn.evaluate.metrics import masked_psnr_db
 from lerobot_msdyn.priors import Priors, estimate_priors
@@ -58,6 +63,9 @@ TRACKS = {"gate": False, "register": False}  # levels are fitted to the tracks, 
 PAPER = TRACKS | {"max_parts": 1}  # and an object is an instance
 
 
+LEARNED = {"learn": LearnConfig(bases=True, begin=0.0)}
+
+
 @dataclass(frozen=True)
 class Row:
     """A way to make new views; the dictionaries change fields of the recipe's parts."""
@@ -66,7 +74,9 @@ class Row:
     motion: dict[str, Any] = field(default_factory=dict)
     scene: dict[str, Any] = field(default_factory=dict)
     weights: dict[str, float] = field(default_factory=dict)
-    learned: str = ""  # whether motion takes part in the fit: "on" from the tracks' motion, "afresh" from none
+    fit: dict[str, Any] = field(default_factory=dict)
+    deformation: str = ""  # whether a deformation field takes part in the fit: "on" from the tracks' motion, "afresh"
+    recipe: str = ""  # what is changed; none: the default
 
 
 ROWS = (
@@ -79,16 +89,39 @@ ROWS = (
     Row("L4", PAPER | {"levels": [*ALL, "particle"]}),
     Row("L1-L3, rgb only", PAPER | {"levels": ALL}, weights={"depth": 0.0, "mask": 0.0}),
     Row("L1-L3, isotropic", PAPER | {"levels": ALL}, {"isotropic": True}),
-    Row("L1-L3, learned", PAPER | {"levels": ALL}, learned="on"),
+    Row("L1-L3, learned", PAPER | {"levels": ALL}, fit=LEARNED),
     Row("flat 10", TRACKS | {"levels": ["flat"]}),
-    Row("flat 10, learned", TRACKS | {"levels": ["flat"]}, learned="on"),
+    Row("flat 10, learned", TRACKS | {"levels": ["flat"]}, fit=LEARNED),
     Row("field", TRACKS | {"levels": ["field"]}),
-    Row("field, learned", TRACKS | {"levels": ["field"]}, learned="on"),
-    Row("field, learned afresh", TRACKS | {"levels": ["field"]}, learned="afresh"),
+    Row("field, learned", TRACKS | {"levels": ["field"]}, deformation="on"),
+    Row("field, learned afresh", TRACKS | {"levels": ["field"]}, deformation="afresh"),
     Row("L1 of parts", TRACKS | {"levels": ["object"]}),
     Row("L1-L3 of parts", TRACKS | {"levels": ALL}),
     Row("the method: registered, gated", {"levels": ALL}),
     Row("the method with overlay", {"levels": ALL}, {"overlay": True}),
+)
+
+
+def paper(name: str, **changes: Any) -> Row:
+    """The paper's method with some of it changed."""
+    changes.setdefault("motion", {"levels": ALL})
+    return Row(f"paper: {name}", recipe="paper", **changes)
+
+
+OTHERS = ("mask", "depth", "track", "rigidity")  # the paper's losses beside that of colour
+PAPER_ROWS = (
+    paper("L1", motion={"levels": ["object"]}),
+    paper("L1+L2", motion={"levels": ["object", "primitive"]}),
+    paper("L1+L2+", motion={"levels": ["object", "primitive"], "primitives": 10}),
+    paper("L1-L3"),
+    paper("L4", motion={"levels": [*ALL, "particle"]}),
+    paper("L1-L3, hard objects", motion={"blend_parts": 1}),
+    paper("L1-L3, bases learned alone", fit={"learn": LearnConfig(bases=True, begin=0.0)}),
+    paper("L1-L3, not learned", fit={"learn": LearnConfig()}),
+    paper("L1-L3, rgb only", weights=dict.fromkeys(OTHERS, 0.0)),
+    *(paper(f"L1-L3, without {loss}", weights={loss: 0.0}) for loss in OTHERS),
+    paper("L1-L3, without density control", fit={"density": DensityConfig()}),
+    paper("L1-L3, with overlay", scene={"overlay": True}),
 )
 
 
@@ -114,13 +147,13 @@ class Prepared:
 
 
 def recipe_of(row: Row, settings: Settings, seed: int) -> Recipe:
-    """The default recipe with a row's changes."""
-    recipe = Recipe(seed=seed)
+    """A row's recipe with its changes."""
+    recipe = replace(load_recipe(row.recipe) if row.recipe else Recipe(), seed=seed)
     recipe.priors.cache = "off"
     recipe.scene = replace(recipe.scene, **({"overlay": False} | row.scene))
     recipe.motion = replace(recipe.motion, **row.motion)
     weights = recipe.fit.weights | row.weights
-    recipe.fit = replace(recipe.fit, steps=settings.steps, max_width=settings.width, weights=weights)
+    recipe.fit = replace(recipe.fit, steps=settings.steps, max_width=settings.width, weights=weights, **row.fit)
     return recipe
 
 
@@ -134,7 +167,7 @@ def prepare(case: Case) -> Prepared:
 
 
 def reconstructed(prepared: Prepared, row: Row, recipe: Recipe) -> Reconstruction:
-    """A row's scene: the package's own steps on given priors, with motion that is learned where the row says so."""
+    """A row's scene: the package's own steps on given priors, with a field that is learned where the row says so."""
 
     def given_priors(draft: Draft) -> None:
         draft.priors = prepared.priors
@@ -145,8 +178,8 @@ def reconstructed(prepared: Prepared, row: Row, recipe: Recipe) -> Reconstructio
     def fitted(draft: Draft) -> None:
         scene = draft.scene
         learned: list[dict[str, Any]] = []
-        if row.learned:
-            scene, learned = with_learned_motion(scene, draft.distance, afresh=row.learned == "afresh")
+        if row.deformation:
+            scene, learned = with_learned_field(scene, afresh=row.deformation == "afresh")
         draft.fitted = fit(
             scene,
             draft.view,
@@ -157,7 +190,7 @@ def reconstructed(prepared: Prepared, row: Row, recipe: Recipe) -> Reconstructio
             seed=recipe.seed,
             learned=learned,
         )
-        draft.scene = with_fixed_motion(draft.fitted.scene)
+        draft.scene = with_fixed_field(draft.fitted.scene)
 
     steps = with_steps({"priors": given_priors, "background": given_background, "fit": fitted})
     return reconstruct(prepared.case.view, recipe, steps=steps)
@@ -210,13 +243,14 @@ def cases(options: argparse.Namespace, settings: Settings) -> Iterator[tuple[str
                 ),
             )
     for scene in options.scenes if options.sim and not options.true_priors else ():
-        yield (
-            scene,
-            0,
-            lambda scene=scene: simulated_case(
-                options.sim / scene, 0, settings.width, settings.stride, settings.sim_every
-            ),
-        )
+        for seed in options.sim_seeds:
+            yield (
+                scene,
+                seed,
+                lambda scene=scene, seed=seed: simulated_case(
+                    options.sim / scene, seed, settings.width, settings.stride, settings.sim_every
+                ),
+            )
 
 
 def read(path: Path, settings: Settings) -> list[dict[str, Any]]:
@@ -235,7 +269,7 @@ def run(options: argparse.Namespace, settings: Settings) -> None:
     priors = "true" if options.true_priors else "own"
     done = {(one["scene"], one["seed"], one["row"]) for one in figures if one["priors"] == priors}
     for name, seed, make in cases(options, settings):
-        rows = [row for row in ROWS if row.name in options.rows and (name, seed, row.name) not in done]
+        rows = [row for row in (*ROWS, *PAPER_ROWS) if row.name in options.rows and (name, seed, row.name) not in done]
         if not rows:
             continue
         prepared = prepare(make())
@@ -259,8 +293,14 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--sim", type=Path, help="folder of simulated episodes (docs/evaluate.md)")
     parser.add_argument("--scenes", type=words, default=["rigid_push", "pick_place", "deformable", "free_arm"])
     parser.add_argument("--true_priors", action="store_true", help="true masks and tracks, of synthetic scenes alone")
-    names = [row.name for row in ROWS]
-    parser.add_argument("--rows", type=lambda text: text.split(";"), default=names, help="; between them")
+    parser.add_argument("--sim_seeds", type=lambda text: [int(word) for word in words(text)], default=[0])
+    names, of_paper = ([row.name for row in rows] for rows in (ROWS, PAPER_ROWS))
+    parser.add_argument(
+        "--rows",
+        type=lambda text: of_paper if text == "paper" else text.split(";"),
+        default=names,
+        help="; between them, or: paper",
+    )
     parser.add_argument("--json", type=Path, default=JSON)
     parser.add_argument("--report", action="store_true", help="print the table of the figures, and plot them")
     for name, value in asdict(Settings()).items():

@@ -14,7 +14,9 @@ Figures = Sequence[dict[str, Any]]
 
 
 def overview_table(figures: Figures, simulated: Iterable[str]) -> str:
-    """A Markdown table: synthetic scenes by the median over seeds of the mean over kinds, simulated ones by their mean.
+    """A Markdown table: synthetic scenes by the median over seeds of the mean over kinds.
+
+    Simulated ones by the mean over scenes of the median over seeds.
 
     Behind the medians stand the least and the largest of the seeds.
     """
@@ -116,6 +118,6 @@ def _over_seeds(figures: Figures, row: str, name: str, kinds: list[str], seeds: 
 
 
 def _mean(figures: Figures, row: str, name: str, scenes: list[str]) -> str:
-    """Mean over the scenes, if all are known."""
-    values = [one[name] for one in figures if one["row"] == row]
-    return f"{sum(values) / len(values):.2f}" if len(values) == len(scenes) else ""
+    """Mean over the scenes, if all are known, each by the median of its seeds."""
+    values = [[one[name] for one in figures if (one["row"], one["scene"]) == (row, scene)] for scene in scenes]
+    return f"{sum(median(each) for each in values) / len(values):.2f}" if all(values) else ""

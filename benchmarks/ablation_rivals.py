@@ -1,4 +1,4 @@
-"""What the ablation compares with that the library does not have: pictures warped by depth, and learned motion."""
+"""What the ablation compares with that the library lacks: pictures warped by depth, and a field that is learned."""
 
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass, replace
@@ -19,8 +19,8 @@ from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.reconstruction.background import EmptyScene
 from lerobot_msdyn.scene.dynamic import DynamicScene
 
-FIELD_RATE = 1e-3  # of a deformation field's layers
-TURN_RATE, SHIFT_RATE = 1e-3, 1e-4  # of the bases' knots; shifts in units of the look-at distance
+FIELD_RATE = 1e-3  # of a deformation field's layers ...
+LAYERS = ("first", "hidden", "biases", "last")  # ... which are these
 LEAST_WEIGHT = 0.05  # of a pixel that something was splatted on
 SAME_SURFACE_M, SAME_SURFACE = 0.006, 0.008  # behind the nearest point, at most this and this share of its depth
 CRACK_NEIGHBOURS = 5  # of eight, that close a crack
@@ -86,31 +86,24 @@ def _sum_of_window(image: ndarray) -> ndarray:
     return cv2.boxFilter(image, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
 
 
-def with_learned_motion(
-    scene: DynamicScene, distance: float, *, afresh: bool
-) -> tuple[DynamicScene, list[dict[str, Any]]]:
-    """A scene whose motion takes part in the fit, and the groups of parameters that Adam needs for that.
+def with_learned_field(scene: DynamicScene, *, afresh: bool) -> tuple[DynamicScene, list[dict[str, Any]]]:
+    """A scene whose deformation field takes part in the fit, and the groups of parameters that Adam needs for that.
 
-    `afresh`: a deformation field begins without any motion (Yang et al. 2024, Deformable 3D Gaussians).
+    `afresh`: it begins without any motion (Yang et al. 2024, Deformable 3D Gaussians).
     """
-    rates_of = {
-        "bases": {"rotations_6d": TURN_RATE, "displacements": SHIFT_RATE * distance},
-        "field": dict.fromkeys(("first", "hidden", "biases", "last"), FIELD_RATE),
-    }
     levels: list[Level] = []
     groups: list[dict[str, Any]] = []
     for level in scene.levels:
         assert is_dataclass(level)
-        rates = rates_of[level.kind]
-        leaves = {name: getattr(level, name).clone() for name in rates}
+        leaves = {name: getattr(level, name).clone() for name in LAYERS}
         if afresh:
             leaves["last"].zero_()
-        groups += [{"params": [leaf.requires_grad_()], "lr": rates[name]} for name, leaf in leaves.items()]
+        groups += [{"params": [leaf.requires_grad_()], "lr": FIELD_RATE} for leaf in leaves.values()]
         levels.append(replace(level, **leaves))
     return replace(scene, levels=tuple(levels)), groups
 
 
-def with_fixed_motion(scene: DynamicScene) -> DynamicScene:
+def with_fixed_field(scene: DynamicScene) -> DynamicScene:
     """The same scene after the fit: nothing is learned any more."""
     levels: list[Level] = []
     for level in scene.levels:

@@ -1,6 +1,6 @@
 """The five iPhone sequences that are scored in papers, by one protocol, beside published rows of the same protocol.
 
-    python benchmarks/dycheck.py --data FOLDER --protocol som --out outputs/dycheck [-- --recipe best ...]
+    python benchmarks/dycheck.py --data FOLDER --protocol som --out outputs/dycheck [-- --fit.steps 75000 ...]
 
 FOLDER holds apple, block, paper-windmill, spin and teddy. What stands behind `--` goes to every
 `python -m lerobot_msdyn.evaluate dycheck`. A sequence whose OUT/<name>/scores.json is there is not run again.

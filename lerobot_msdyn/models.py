@@ -1,6 +1,6 @@
 """Command line: the learned models that can be used, which of them are on this machine, and how to get the others.
 
-python -m lerobot_msdyn.models ls | fetch NAME ... | check
+python -m lerobot_msdyn.models list | fetch NAME ... | check
 """
 
 import sys
@@ -9,7 +9,7 @@ from lerobot_msdyn.core.cli import EXIT_BAD_INPUT, EXIT_OK, run_command
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.priors.models import MODELS
 
-USAGE = """usage: python -m lerobot_msdyn.models ls               every model: size, licence, purpose, and if it is here
+USAGE = """usage: python -m lerobot_msdyn.models list             every model: size, licence, purpose, and if it is here
        python -m lerobot_msdyn.models fetch NAME ...   download models, and check them
        python -m lerobot_msdyn.models check            whether those that are here are what they should be
 """
@@ -21,14 +21,14 @@ def run(arguments: list[str]) -> int:
         sys.stdout.write(USAGE)
         return EXIT_OK
     match arguments:
-        case ["ls"]:
+        case ["list" | "ls"]:
             sys.stdout.write("".join(_lines(name) for name in MODELS))
         case ["fetch", _, *_]:
             _fetch(arguments[1:])
         case ["check"]:
             return _check()
         case _:
-            raise ConfigError(f"models: got {' '.join(arguments)!r}; expected ls, fetch NAME ... or check")
+            raise ConfigError(f"models: got {' '.join(arguments)!r}; expected list, fetch NAME ... or check")
     return EXIT_OK
 
 

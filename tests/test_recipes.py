@@ -10,7 +10,7 @@ from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.recipes import run
 
 PROJECT = Path(__file__).parent.parent
-NAMES = ["balanced", "best", "multi_camera", "quick", "rgbd", "so101_front"]
+NAMES = ["balanced", "best", "multi_camera", "paper", "quick", "rgbd", "so101_front"]
 
 
 @pytest.mark.parametrize("name", ["list", "ls"])

@@ -46,9 +46,10 @@ def parse_config[T](
     aliases: Mapping[str, str],
     *,
     command: str,
+    recipe: str | None = None,
     essentials: Essentials | None = None,
 ) -> T:
-    """The config that a command line describes: defaults, then `--recipe`, then the other flags.
+    """The config that a command line describes: defaults, then `--recipe` (or `recipe`), then the other flags.
 
     Prints the help and exits on `-h`, `--help` (the essentials, where a command names them) or `--help-all`.
 
@@ -61,11 +62,12 @@ def parse_config[T](
             plugins = _split_flags([item for item in arguments if item not in HELP], aliases)[1]
         import_plugins(plugins)
         if essentials is None or any(HELP.get(item) for item in arguments):
-            sys.stdout.write(format_help(config_class, aliases, command))
+            sys.stdout.write(format_help(config_class, aliases, command, recipe))
         else:
             sys.stdout.write(format_essentials(config_class, aliases, command, essentials))
         sys.exit(EXIT_OK)
-    recipe, plugins, overrides = _split_flags(arguments, aliases)
+    named, plugins, overrides = _split_flags(arguments, aliases)
+    recipe = named if named is not None else recipe
     import_plugins(plugins)
     overrides = _lists(config_class, overrides)
     content: dict[str, Any] = draccus.encode(config_class())

@@ -42,12 +42,13 @@ def format_essentials(config_class: type, aliases: Mapping[str, str], command: s
     return f"{_purpose(config_class)}\n\n{examples}\n{options}\nAll settings: {command} --help-all\n{EXIT_CODES}\n"
 
 
-def format_help(config_class: type, aliases: Mapping[str, str], command: str) -> str:
+def format_help(config_class: type, aliases: Mapping[str, str], command: str, recipe: str | None = None) -> str:
     """The whole help: every field with its type, its default and the comment that stands above it."""
     names = ", ".join(f"--{alias} for --{name}" for alias, name in aliases.items() if alias != name)
+    without = "" if recipe is None else f" (default: {recipe})"
     head = (
         f"usage: {command} [--field value ...]\n\n{inspect.getdoc(config_class)}\n\n"
-        f"  --recipe NAME_OR_FILE\n      A YAML file with any of the fields below, read before the flags; "
+        f"  --recipe NAME_OR_FILE{without}\n      A YAML file with any of the fields below, read before the flags; "
         f"by name: {_recipes()}.\n  --plugins MODULE_OR_FILE.py\n      Your own providers, motion levels, "
         f"perturbations or loss terms, imported before the recipe is read (docs/extending.md).\n\n"
         f"{f'Short names: {names}.{chr(10)}' if names else ''}{EXIT_CODES}\n"

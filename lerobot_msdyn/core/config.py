@@ -150,6 +150,10 @@ class MotionConfig:
     levels: list[str] = field(default_factory=lambda: list(_LEVELS))
     # Rigid parts per moving instance at the object level (a robot arm is one instance with several parts).
     max_parts: int = between(6, 1, 64)
+    # Parts that a Gaussian follows at the object level, by their nearness; 1: its own alone.
+    blend_parts: int = between(1, 1, 64)
+    # Distance at which a neighbouring part counts 0.6 of a Gaussian's own, in units of the parts' usual reach.
+    blend_reach: float = between(0.1, 0.001, 100)
     # Primitives per rigid part.
     primitives: int = between(5, 1, 1000)
     # Grains per primitive.
@@ -234,6 +238,53 @@ class LearningRates:
     opacity_logits: float = between(2e-2, 0, 1)
     # Colour coefficients.
     colours: float = between(1e-2, 0, 1)
+    # Turns of motion bases (the first two columns of their rotations), where they are learned.
+    basis_turns: float = between(1e-3, 0, 1)
+    # Shifts of motion bases, in units of the scene's look-at distance, likewise.
+    basis_shifts: float = between(1e-4, 0, 1)
+    # Logits of the weights by which Gaussians follow bases, likewise.
+    motion_weights: float = between(1e-2, 0, 1)
+
+
+@dataclass
+class LearnConfig:
+    """Which of the motion is learned with the Gaussians; without, it stays as it was estimated."""
+
+    # Whether the bases of all levels are.
+    bases: bool = False
+    # Whether the weights by which Gaussians follow them are.
+    weights: bool = False
+    # Share of the steps after which it begins.
+    begin: float = between(0.3, 0, 1)
+    # The better the tracks agree with a basis, the slower it is learned: at half the rate where they miss it by so many
+    # pixels (median, of pictures 320 wide); 0: all bases at the full rate, also those that no track follows.
+    sure_px: float = between(0.0, 0, INFINITY)
+
+
+@dataclass
+class DensityConfig:
+    """Adaptive density control of the static and the moving set (3DGS, Kerbl et al. 2023, section 5.2)."""
+
+    # Whether Gaussians are cloned, split and pruned during the fit.
+    enabled: bool = False
+    # Share of the steps at which it begins ...
+    begin: float = between(0.05, 0, 1)
+    # ... and ends.
+    end: float = between(0.6, 0, 1)
+    # Steps from one round to the next.
+    every: int = between(50, 1, 1_000_000)
+    # Mean gradient of a Gaussian's place in the image, in halves of the picture, beyond which it is cloned or split.
+    gradient: float = between(2e-4, 0, INFINITY)
+    # Largest standard deviation of those that are cloned, in units of the look-at distance; larger ones are split.
+    clone_size: float = between(0.005, 0, INFINITY)
+    # Opacity below which a Gaussian is pruned.
+    min_opacity: float = between(0.05, 0, 1)
+    # Largest standard deviation, in units of the look-at distance, beyond which a Gaussian is pruned.
+    max_size: float = between(0.1, 0, INFINITY)
+    # Steps from one reset of the opacities to the next; 0: never.
+    reset_every: int = between(3000, 0, 1_000_000)
+    # Largest number of Gaussians of either set, relative to what it began with.
+    growth: float = between(2.0, 1, 1000)
 
 
 @dataclass
@@ -258,9 +309,13 @@ class FitConfig:
     patience: int = between(150, 1, 1_000_000)
     # Weight of each loss term; those that are not named, or have 0, are not used. rgb: absolute colour difference;
     # depth: absolute difference of inverse depth, relative to its mean; mask: absolute difference between the rendered
-    # share of moving Gaussians and the mask of what moves; or a user's own (--fit.weights.NAME).
+    # share of moving Gaussians and the mask of what moves; ssim: 1 - structural similarity; track: distance between
+    # where points are carried and where they were tracked; rigidity: change of neighbours' offsets between two frames;
+    # or a user's own (--fit.weights.NAME).
     weights: dict[str, float] = numbers_of({"rgb": 1.0, "depth": 0.1, "mask": 0.1}, 0, MAX_WEIGHT, registry=LOSSES)
     learning_rates: LearningRates = field(default_factory=LearningRates)
+    learn: LearnConfig = field(default_factory=LearnConfig)
+    density: DensityConfig = field(default_factory=DensityConfig)
 
 
 @dataclass

@@ -43,11 +43,14 @@ class Evaluation:
     run: Callable[[Any], str]  # config -> what is printed
     needed: dict[str, str]  # flag -> field that must be given
     usage: str
+    recipe: str | None = None  # where the command line names none
 
 
 EVALUATIONS = {
     "nvs": Evaluation(EvaluateConfig, _nvs, {"scene": "scene_folder", "out": "out"}, "--scene FOLDER --out DIR"),
-    "dycheck": Evaluation(DycheckConfig, _dycheck, {"root": "root", "out": "out"}, "--root SEQUENCE --out DIR"),
+    "dycheck": Evaluation(
+        DycheckConfig, _dycheck, {"root": "root", "out": "out"}, "--root SEQUENCE --out DIR", recipe="paper"
+    ),
     "heldout-camera": Evaluation(
         HeldoutCameraConfig,
         _heldout_camera,
@@ -75,7 +78,7 @@ def run(arguments: list[str]) -> int:
     if kind is None:
         raise ConfigError(f"which evaluation? got {name!r}; expected: {COMMAND} {' | '.join(EVALUATIONS)} (--help)")
     command = f"{COMMAND} {name}"
-    config: Any = parse_config(kind.config, arguments[1:], kind.needed, command=command)
+    config: Any = parse_config(kind.config, arguments[1:], kind.needed, command=command, recipe=kind.recipe)
     empty = kind.config()
     for flag, path in kind.needed.items():
         if _value(config, path) == _value(empty, path):

@@ -104,9 +104,10 @@ def motion_from_tracks(tracks: LiftedTracks, config: MotionConfig, recording: Re
     if len(config.levels) > 1:
         left = _left_by(first, levels[0], given, tracks.valid)
         motion = _with_finer_levels(motion, left, tracks, config, given.noise, by_video)
+    soft = replace(motion, blend_parts=config.blend_parts, blend_reach=config.blend_reach)
     if recording is None:
-        return motion
-    return recording.guided(replace(registered, names=motion.names, levels=motion.levels))
+        return soft
+    return recording.guided(replace(soft, points=registered.points, part=registered.part, instance=registered.instance))
 
 
 def _with_finer_levels(

@@ -3,14 +3,14 @@
 import logging
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from lerobot_msdyn.core.config import FitConfig, LearningRates
+from lerobot_msdyn.core.config import FitConfig
 from lerobot_msdyn.core.errors import EpisodeError
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.core.registries import LOSSES
@@ -18,16 +18,18 @@ from lerobot_msdyn.core.sampling import evenly, scaled_window
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.reconstruction.brightness import moving_gain, static_shading
+from lerobot_msdyn.reconstruction.density import Density
+from lerobot_msdyn.reconstruction.doubt import doubts
 from lerobot_msdyn.reconstruction.loss_terms import FitStep, Targets, certain_pixels
+from lerobot_msdyn.reconstruction.parameters import Parameters
 from lerobot_msdyn.scene.dynamic import DynamicScene
-from lerobot_msdyn.scene.gaussians import Gaussians, with_slope
-from lerobot_msdyn.scene.rendering import render_scene
-from lerobot_msdyn.scene.shading import no_shading
+from lerobot_msdyn.scene.gaussians import with_slope
+from lerobot_msdyn.scene.rendering import render_scene, render_snapshot
+from lerobot_msdyn.scene.shading import Shading, no_shading
 
 logger = logging.getLogger(__name__)
 
 MASK_BAND_PX = 2  # of 320: the mask is not trusted closer than this to its border
-FINAL_RATE = 0.1  # the learning rates decay exponentially to this share
 CHECK_STEPS = 50  # from one look at the held-out frames to the next
 GAIN_DB = 0.02  # less than this is no improvement
 SCORED_FRAMES = 5  # of the recorded camera, whose error is reported
@@ -60,7 +62,7 @@ def fit(
 ) -> FitResult:
     """Fit a scene to one camera's video, on the device that holds the scene.
 
-    Motion stays as it was initialised, unless its tensors are `learned`.
+    Motion stays as it was initialised, unless `config.learn` says otherwise or its tensors are `learned`.
 
     Args:
         scene: where to start from; it is not changed.
@@ -84,38 +86,43 @@ def fit(
         scene = replace(scene, shading=to_device(shading, scene.device))
     if config.sh_degree > 0:
         scene = replace(scene, moving=with_slope(scene.moving))
-    scene, optimizer = _trainable(scene, config.learning_rates, distance)
-    for group in learned:
-        optimizer.add_param_group(group)
-    decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, FINAL_RATE ** (1 / max(config.steps, 1)))
+    doubt = doubts(to_device(scene, "cpu"), view.camera, priors, config.learn.sure_px) if config.learn.bases else ()
+    parameters = Parameters(scene, config, distance, doubt, learned)
+    density = Density(config.density, parameters, config.steps, distance, seed)
     moves = priors.instances > 0
     certain = certain_pixels(moves, scaled_window(MASK_BAND_PX, view.camera.width))
     targets = to_device(Targets(view, priors, moves, certain, distance), scene.device)
     terms = {name: (LOSSES.get(name), weight) for name, weight in config.weights.items() if weight > 0}
     order, held_out = _frames(len(view.rgb), config.held_out_frames, seed)
     enough = _Enough(targets.view, held_out, config.patience, backend)
+    random = torch.Generator().manual_seed(seed)
     history: list[dict[str, Tensor]] = []
     for step in range(config.steps):
+        if step == int(config.learn.begin * config.steps):
+            parameters.begin_motion()
+        scene = parameters.scene
         if step == int(config.moving_gain_from * config.steps) and len(scene.moving) > 0:
-            scene = _with_moving_gain(scene, view, priors, backend)
+            parameters.shade(_measured_shading(scene, view, priors, backend))
+            scene = parameters.scene
         frames = next(order).to(scene.device)
-        rendering = render_scene(scene, targets.view.camera.select(frames), frames, backend)
-        now = FitStep(scene, frames, rendering, targets)
+        camera = targets.view.camera.select(frames)
+        snapshot = scene.at(frames, camera.world_from_camera[:, :3, 3])
+        density.watch(snapshot)
+        now = FitStep(scene, frames, render_snapshot(snapshot, camera, scene.near, backend), targets, random, backend)
         values = {name: term(now) for name, (term, _) in terms.items()}
-        optimizer.zero_grad(set_to_none=True)
+        loss: Float[Tensor, ""] | None = None
         if values:
             loss = torch.stack([terms[name][1] * value for name, value in values.items()]).sum()
             _check(loss, step, frames)
-            loss.backward()
-        optimizer.step()
-        decay.step()
+        parameters.step(loss)
+        density.after(step + 1, snapshot, camera)
         history.append({name: value.detach() for name, value in values.items()})
         progress(1)
-        if enough(scene, step + 1):
+        if enough(parameters.scene, step + 1):
             break
     if len(history) < config.steps:
         progress(config.steps - len(history))
-    return _result(_detached(scene), history, targets.view, held_out, backend, time.perf_counter() - start)
+    return _result(parameters.result(), history, targets.view, held_out, backend, time.perf_counter() - start)
 
 
 @torch.no_grad()
@@ -169,10 +176,11 @@ def _check(loss: Float[Tensor, ""], step: int, frames: Int[Tensor, "1"]) -> None
         )
 
 
-def _with_moving_gain(scene: DynamicScene, view: View, priors: Priors, backend: str) -> DynamicScene:
+def _measured_shading(scene: DynamicScene, view: View, priors: Priors, backend: str) -> Shading:
+    """The scene's brightness over time, that of the moving set as it is measured now."""
     shading = scene.shading or to_device(no_shading(len(scene.static), len(scene.moving), scene.frames), scene.device)
     gain = moving_gain(scene, view, priors, backend).to(scene.device)
-    return replace(scene, shading=replace(shading, moving=gain))
+    return replace(shading, moving=gain)
 
 
 def _result(
@@ -196,29 +204,3 @@ def _result(
         result.train_psnr_db,
     )
     return result
-
-
-def _trainable(
-    scene: DynamicScene, rates: LearningRates, distance: float
-) -> tuple[DynamicScene, torch.optim.Optimizer]:
-    """The scene with its Gaussians as leaves, and Adam over them."""
-    rate = {
-        "means": rates.means * distance,
-        "quats": rates.quats,
-        "log_scales": rates.log_scales,
-        "opacity_logits": rates.opacity_logits,
-        "sh": rates.colours,
-    }
-    static, moving = (
-        Gaussians(**{item.name: getattr(part, item.name).clone().requires_grad_() for item in fields(part)})
-        for part in (scene.static, scene.moving)
-    )
-    groups = [{"params": [getattr(part, name)], "lr": lr} for part in (static, moving) for name, lr in rate.items()]
-    return replace(scene, static=static, moving=moving), torch.optim.Adam(groups, eps=1e-15, fused=True)
-
-
-def _detached(scene: DynamicScene) -> DynamicScene:
-    def plain(part: Gaussians) -> Gaussians:
-        return Gaussians(**{item.name: getattr(part, item.name).detach() for item in fields(part)})
-
-    return replace(scene, static=plain(scene.static), moving=plain(scene.moving))

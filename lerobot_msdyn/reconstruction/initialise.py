@@ -58,7 +58,9 @@ def initialise(
     moving, part = gather_moving(view, priors, estimated, scene)
     if scene.isotropic:
         static, moving = isotropic(static), isotropic(moving)
-    return DynamicScene(static, moving, estimated.levels, *estimated.bind(moving.means, part), len(view.rgb))
+    bindings = estimated.bind(moving.means, part)
+    canonical = estimated.canonical_frame
+    return DynamicScene(static, moving, estimated.levels, *bindings, len(view.rgb), canonical_frame=canonical)
 
 
 def _motion(view: View, priors: Priors, config: MotionConfig) -> SceneMotion | None:

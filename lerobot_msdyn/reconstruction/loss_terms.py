@@ -34,6 +34,8 @@ class FitStep:
     frames: Int[Tensor, " b"]  # that are compared
     rendering: Rendering  # of these frames, through the recorded camera; carries gradients
     targets: Targets
+    random: torch.Generator  # for terms that draw; on the host
+    backend: str = "auto"  # of the rasterizer, for terms that render
 
 
 LossTerm = Callable[[FitStep], Float[Tensor, ""]]  # unweighted; the weight is the recipe's

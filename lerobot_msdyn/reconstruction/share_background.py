@@ -85,7 +85,8 @@ def _fitted(background: SharedBackground, recipe: Recipe) -> SharedBackground:
     priors = Priors(empty.depth[None], nothing, _no_tracks(), DepthTraits(metric=True))
     view = View(empty.rgb[None], camera)
     scene = initialise(view, priors, replace(recipe.scene, moving_gaussians=0), recipe.motion, empty)
-    config = replace(recipe.fit, steps=recipe.fit.steps // 2, shadows=False, held_out_frames=0)
+    pixel_by_pixel = replace(recipe.fit.density, enabled=False)  # as `adapted` expects it
+    config = replace(recipe.fit, steps=recipe.fit.steps // 2, shadows=False, held_out_frames=0, density=pixel_by_pixel)
     try:
         distance = look_at_distance(empty.depth)
         scene = replace(scene, near=NEAR * distance)

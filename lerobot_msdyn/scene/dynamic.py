@@ -8,7 +8,7 @@ from torch import Tensor
 
 from lerobot_msdyn.core.geometry import quaternion_conjugate, quaternion_multiply, quaternion_to_matrix
 from lerobot_msdyn.core.serialise import named_tensors
-from lerobot_msdyn.motion.model.compose import Level, compose
+from lerobot_msdyn.motion.model.compose import Level, compose, compose_points
 from lerobot_msdyn.scene.gaussians import Gaussians, shaded
 from lerobot_msdyn.scene.overlay import PATCH_OPACITY, FramePatch, Overlay
 from lerobot_msdyn.scene.shading import Shading
@@ -54,11 +54,17 @@ class DynamicScene:
     shading: Shading | None = None  # none: brightness does not change
     near: float = 0.01  # m; nothing that is as near to a camera is rendered
     overlay: Overlay | None = None  # none: nothing is shown as it was recorded
+    canonical_frame: int = 0  # at which all bases are the identity; of use to the fit alone, files do not keep it
 
     @property
     def device(self) -> torch.device:
         """Where its tensors are."""
         return self.static.means.device
+
+    def select_static(self, which: Tensor | slice) -> "DynamicScene":
+        """The same with some Gaussians of the static set, by index, mask or slice; of a scene without an overlay."""
+        shading = None if self.shading is None else replace(self.shading, places=self.shading.places[which])
+        return replace(self, static=self.static.select(which), shading=shading)
 
     def select_moving(self, which: Tensor | slice) -> "DynamicScene":
         """The same with some Gaussians of the moving set, by index, mask or slice; of a scene without an overlay."""
@@ -88,6 +94,11 @@ class DynamicScene:
             rgb=self._colours(frames, means, quats, eye),
             moving=torch.cat((torch.zeros_like(static.opacity_logits), torch.ones_like(moving.opacity_logits))),
         )
+
+    def positions(self, frames: Int[Tensor, " b"]) -> Float[Tensor, "b g 3"]:
+        """Where all Gaussians (m; the static ones first) are at some frames, as `at` has them."""
+        moving = compose_points(self.moving.means, self.levels, self.indices, self.logits, frames.to(self.device))
+        return torch.cat((self.static.means.expand(len(frames), -1, -1), moving), dim=1)
 
     def tensors(self) -> dict[str, Tensor]:
         """All that the scene is made of, by the names of its file."""

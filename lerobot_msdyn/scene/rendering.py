@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
@@ -13,6 +13,8 @@ from lerobot_msdyn.render import Raster, rasterize
 from lerobot_msdyn.render.cpu.threads import torch_on_one_thread
 from lerobot_msdyn.scene.dynamic import DynamicScene, Snapshot, patched
 from lerobot_msdyn.scene.overlay import FramePatch
+
+_FAINT = 1e-6  # opacity by which nothing is divided
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ def render_scene(
     """
     if scene.overlay is None:
         camera, frames = to_device((camera, frames), scene.device)
-        return _rasterized(_snapshot(scene, camera, frames, extra), camera, scene.near, backend)
+        return render_snapshot(_snapshot(scene, camera, frames, extra), camera, scene.near, backend)
     gaussians = len(scene.static) + len(scene.moving)
     parts = [
         render_patched(scene, camera.select([i]), frame, scene.overlay.patch(frame, gaussians), backend, extra)
@@ -60,7 +62,7 @@ def render_patched(
 ) -> Rendering:
     """The scene at one frame through one pose, with a patch in place of what the patch hides."""
     camera, when, patch = to_device((camera, torch.tensor([frame]), patch), scene.device)
-    return _rasterized(patched(_snapshot(scene, camera, when, extra), patch), camera, scene.near, backend)
+    return render_snapshot(patched(_snapshot(scene, camera, when, extra), patch), camera, scene.near, backend)
 
 
 def _snapshot(scene: DynamicScene, camera: CameraTrack, frames: Tensor, extra: Float[Tensor, " m"] | None) -> Snapshot:
@@ -70,7 +72,8 @@ def _snapshot(scene: DynamicScene, camera: CameraTrack, frames: Tensor, extra: F
     return replace(snapshot, extra=torch.cat((extra.new_zeros(len(scene.static)), extra)))
 
 
-def _rasterized(snapshot: Snapshot, camera: CameraTrack, near: float, backend: str) -> Rendering:
+def render_snapshot(snapshot: Snapshot, camera: CameraTrack, near: float, backend: str = "auto") -> Rendering:
+    """What one pose per frame of a snapshot sees of it; all on one device."""
     values = [snapshot.moving] if snapshot.extra is None else [snapshot.moving, snapshot.extra]
     raster: Raster = rasterize(
         snapshot.means,
@@ -87,6 +90,34 @@ def _rasterized(snapshot: Snapshot, camera: CameraTrack, near: float, backend: s
     )
     rgb, moving, *more = raster.features.split([3] + [1] * len(values), dim=-1)
     return Rendering(rgb, raster.depth, raster.alpha, moving[..., 0], more[0][..., 0] if more else None)
+
+
+def render_positions(
+    scene: DynamicScene, camera: CameraTrack, frame: int, times: Int[Tensor, " b"], backend: str = "auto"
+) -> tuple[Float[Tensor, "h w b 3"], Float[Tensor, "h w"]]:
+    """Where what is seen at one frame, through one pose, is at some times (m, in the world); and its opacity.
+
+    Positions are blended like colours and divided by the opacity (Shape of Motion, Wang et al. 2024, section 3.3).
+    Differentiable; the scene's overlay has no motion, and is left out.
+    """
+    camera, when = to_device((camera, torch.tensor([frame])), scene.device)
+    snapshot = scene.at(when)
+    positions = scene.positions(times).transpose(0, 1)
+    raster = rasterize(
+        snapshot.means,
+        snapshot.quats,
+        snapshot.scales,
+        snapshot.opacities,
+        positions.flatten(1),
+        camera.camera_from_world,
+        camera.intrinsics,
+        camera.width,
+        camera.height,
+        near=scene.near,
+        backend=backend,
+    )
+    blended = raster.features[0] / raster.alpha[0, ..., None].clamp(min=_FAINT)
+    return blended.unflatten(-1, (len(times), 3)), raster.alpha[0]
 
 
 @torch.no_grad()

@@ -86,11 +86,32 @@ def test_motion_that_is_learned_changes_in_the_fit_and_is_fixed_afterwards(ablat
         row = next(row for row in ablation.ROWS if row.name == name)
         scenes = [
             ablation.reconstructed(prepared, one, ablation.recipe_of(one, settings, 0)).windows[0].scene
-            for one in (replace(row, learned=""), row)
+            for one in (replace(row, deformation="", fit={}), row)
         ]
         fixed, learned = (getattr(scene.levels[0], tensor) for scene in scenes)
         assert not learned.requires_grad
         assert not torch.equal(fixed, learned)
+
+
+def test_the_rows_of_the_paper_change_one_thing_each_of_its_recipe(ablation: ModuleType) -> None:
+    settings = ablation.Settings(steps=7, width=64)
+    recipes = {row.name: asdict(ablation.recipe_of(row, settings, 1)) for row in ablation.PAPER_ROWS}
+    whole = recipes["paper: L1-L3"]
+    assert whole["fit"]["learn"] == {"bases": True, "weights": True, "begin": 0, "sure_px": 0}
+    assert whole["fit"]["density"]["enabled"]
+    assert (whole["fit"]["steps"], whole["fit"]["max_width"], whole["seed"]) == (7, 64, 1)
+    changed = {
+        name: [
+            (part, field)
+            for part in ("scene", "motion", "fit")
+            for field, value in recipe[part].items()
+            if value != whole[part][field]
+        ]
+        for name, recipe in recipes.items()
+    }
+    assert changed.pop("paper: L1-L3") == []
+    assert changed.pop("paper: L1+L2+") == [("motion", "levels"), ("motion", "primitives")]
+    assert all(len(fields) == 1 for fields in changed.values())
 
 
 def test_true_priors_are_those_of_the_synthetic_scene(ablation: ModuleType) -> None:

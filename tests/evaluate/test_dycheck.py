@@ -2,6 +2,7 @@
 
 import importlib
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from pictures import read_picture
 
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.evaluate import __main__ as evaluate
-from lerobot_msdyn.evaluate.config import Protocol
+from lerobot_msdyn.evaluate.config import DycheckConfig, Protocol
 from lerobot_msdyn.evaluate.dycheck.iphone import read_sequence
 from lerobot_msdyn.evaluate.metrics import masked_psnr_db, partial_ssim
 
@@ -42,6 +43,26 @@ def test_the_fit_beats_the_recorded_picture(
         assert written["images"][name]["mssim"] == pytest.approx(partial_ssim(rendered, true, mask), abs=1e-4)
     means = {score: np.mean([image[score] for image in written["images"].values()]) for score in fitted}
     assert fitted == pytest.approx(means, abs=1e-4)
+
+
+def test_it_takes_the_papers_method_where_no_recipe_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[DycheckConfig] = []
+
+    def keep(config: DycheckConfig) -> str:
+        seen.append(config)
+        return ""
+
+    kind = replace(evaluate.EVALUATIONS["dycheck"], run=keep)
+    monkeypatch.setitem(evaluate.EVALUATIONS, "dycheck", kind)
+    arguments = ["dycheck", "--root", "there", "--out", "here"]
+    evaluate.run([*arguments, "--fit.steps", "7"])
+    evaluate.run([*arguments, "--recipe", "quick"])
+    paper, quick = seen
+    assert paper.fit.learn.bases
+    assert paper.fit.weights["track"] > 0
+    assert not paper.scene.overlay
+    assert paper.fit.steps == 7
+    assert not quick.fit.learn.bases
 
 
 def test_the_table_of_five_sequences(

@@ -5,9 +5,11 @@ import dataclasses
 import pytest
 import torch
 from motion_levels import of_bases
+from moving_cards import in_single, moving_cards, recorded_in_single
 from still_video import FRAMES, grey_scene, still_video
 
-from lerobot_msdyn.core.config import FitConfig, LearningRates
+from lerobot_msdyn.core.cli import parse_config
+from lerobot_msdyn.core.config import FitConfig, LearningRates, Recipe
 from lerobot_msdyn.core.errors import EpisodeError
 from lerobot_msdyn.motion.model.bases import identity_level
 from lerobot_msdyn.reconstruction.fit import FitResult, fit, psnr
@@ -59,6 +61,45 @@ def test_motion_is_learned_where_its_tensors_are_given() -> None:
     result = fit(scene, view, priors, FitConfig(steps=3), empty=view.rgb[0], distance=1.0, seed=0, learned=learned)
     assert result.scene.levels is scene.levels
     assert not torch.equal(shift, before)
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ["--fit.learn.bases", "true", "--fit.learn.begin", "0"],
+        ["--fit.learn.weights", "true", "--fit.learn.begin", "0"],
+        ["--fit.learn.bases", "true", "--fit.learn.begin", "0", "--fit.learn.sure_px", "3"],
+        ["--fit.weights.track", "1"],
+        ["--fit.weights.rigidity", "1"],
+        ["--fit.weights.ssim", "0.2"],
+        ["--fit.density.enabled", "true", "--fit.density.every", "2", "--fit.density.gradient", "1e-5"],
+        ["--recipe", "paper"],
+    ],
+    ids=lambda flags: " ".join(flags[:2]),
+)
+def test_each_part_of_the_papers_fit_is_one_switch_away_and_changes_the_result(flags: list[str]) -> None:
+    double = moving_cards()
+    scene, (view, priors) = in_single(double), recorded_in_single(double)
+    common = ["--fit.steps", "4", "--fit.held_out_frames", "0"]
+    with_it, without = (
+        fit(
+            scene,
+            view,
+            priors,
+            parse_config(Recipe, [*some, *common], {}, command="fit").fit,
+            empty=view.rgb[0],
+            distance=1.0,
+            seed=0,
+        ).scene.tensors()
+        for some in (flags, [])
+    )
+    assert any(
+        tensor.shape != without[name].shape or not torch.equal(tensor, without[name])
+        for name, tensor in with_it.items()
+    )
+    assert all(bool(tensor.float().isfinite().all()) for tensor in with_it.values())
+    assert torch.equal(without["levels.0.displacements"], of_bases(scene.levels)[0].displacements)
+    assert torch.equal(without["levels.0.logits"], scene.logits[0])
 
 
 def test_same_seed_same_result() -> None:

@@ -75,7 +75,9 @@ def test_a_term_of_ones_own_sees_the_scene_and_is_minimised(monkeypatch: pytest.
 
 
 def test_a_term_that_is_not_there_is_refused_before_anything_is_done() -> None:
-    with pytest.raises(ConfigError, match=r"fit.weights.sharp is unknown; expected one of depth, mask, rgb"):
+    with pytest.raises(
+        ConfigError, match=r"fit.weights.sharp is unknown; expected one of depth, mask, rgb, rigidity, ssim, track"
+    ):
         parse_config(AugmentConfig, ["--fit.weights.sharp", "0.1"], {}, command="augment")
     with pytest.raises(ConfigError, match=r"fit.weights.rgb is -1"):
         parse_config(AugmentConfig, ["--fit.weights.rgb", "-1"], {}, command="augment")

@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lerobot_msdyn.core.geometry import quaternion_to_matrix
+from lerobot_msdyn.motion.model.binding import nearest_parts
 from lerobot_msdyn.motion.model.compose import Level, compose, compose_points
 from lerobot_msdyn.motion.spec import Binding, first_level, level_spec
 
@@ -28,15 +29,23 @@ class SceneMotion:
     points: Float[Tensor, "n 3"]  # m, tracked points at the canonical frame
     part: Int[Tensor, " n"]  # basis of the first level that each follows
     instance: Int[Tensor, " n"]
+    blend_parts: int = 1  # parts that a point follows at the first level, if that is one of rigid parts
+    blend_reach: float = 0.1  # see `MotionConfig`
 
     @property
     def is_rigid(self) -> bool:
         """Whether every point follows one rigid motion alone."""
-        return len(self.levels) == 1 and first_level(self.names[0]).rigid
+        return len(self.levels) == 1 and first_level(self.names[0]).rigid and self.blend_parts == 1
 
     def bind(self, points: Float[Tensor, "m 3"], part: Int[Tensor, " m"]) -> Bindings:
         """Indices and logits, per level, of canonical points (m) of known parts."""
-        return bind(self.names, self.levels, points, part)
+        indices, logits = bind(self.names, self.levels, points, part)
+        if self.blend_parts == 1 or not first_level(self.names[0]).rigid:
+            return indices, logits
+        followed, weights = nearest_parts(
+            points, part, self.points, self.part, self.instance, self.blend_parts, self.blend_reach
+        )
+        return (followed, *indices[1:]), (weights, *logits[1:])
 
     def moved(
         self, points: Float[Tensor, "m 3"], part: Int[Tensor, " m"], times: Tensor
