@@ -40,7 +40,7 @@ class AugmentConfig(Recipe):
 
 
 ESSENTIALS = Essentials(
-    fields=("repo_id", "root", "new_repo_id", "episodes", "cameras", "variants", "dry_run", "workers", "device"),
+    fields=("repo_id", "root", "new_repo_id", "episodes", "cameras", "variants", "fetch_models", "dry_run", "workers"),
     examples=(
         "--repo local/ds",
         "--repo local/ds --episodes 0-2 --recipe quick",

@@ -28,7 +28,7 @@ class Essentials:
 def format_essentials(config_class: type, aliases: Mapping[str, str], command: str, essentials: Essentials) -> str:
     """The short help: what the command is for, examples, and the fields that matter most."""
     flags = {name: f"--{alias}" for alias, name in aliases.items()}
-    shown = [("--recipe NAME_OR_FILE", f"Settings by name ({_recipes()}) or from a YAML file")]
+    shown = [("--recipe NAME_OR_FILE", f"By name ({_recipes()}) or a YAML file")]
     fields = {item.name: item for item in dataclasses.fields(config_class)}
     for name in essentials.fields:
         default = _default(fields[name])
