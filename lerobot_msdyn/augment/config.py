@@ -33,7 +33,7 @@ class AugmentConfig(Recipe):
     verbose: bool = False
     # Throw away what an unfinished run for the same output has finished, instead of going on with it.
     restart: bool = False
-    # Download the depth model that would be used, where depth would otherwise be an assumed table plane.
+    # Download a depth model where depth would otherwise be assumed (a table plane).
     fetch_models: bool = False
     # Work on a converted copy of a source of version v2.1; the source stays as it is.
     convert: bool = False
