@@ -18,6 +18,7 @@ COMMANDS = {  # name -> module, purpose
     "split": ("split", "train and evaluation episodes with no recording on both sides"),
     "carry": ("carry", "provenance for datasets that LeRobot's tools made of others"),
     "evaluate": ("evaluate.__main__", "score reconstructions on views that were not fitted"),
+    "synthetic": ("synthetic.__main__", "make small datasets with ground truth"),
 }
 
 

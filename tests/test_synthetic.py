@@ -21,7 +21,7 @@ from lerobot_msdyn.synthetic import (
     write_dataset,
     write_nvs_folder,
 )
-from lerobot_msdyn.synthetic.__main__ import main
+from lerobot_msdyn.synthetic.__main__ import run
 from lerobot_msdyn.synthetic.intersect import BOX, CYLINDER, ELLIPSOID, SHEET, Geometry, hit
 from lerobot_msdyn.synthetic.raycast import Appearance, Pinhole, see_points, trace_color, trace_surface
 
@@ -395,7 +395,8 @@ def test_the_nvs_folder_is_complete(tmp_path: Path) -> None:
 
 def test_command_line(tmp_path: Path) -> None:
     arguments = ["--out", str(tmp_path / "ds"), "--episodes", "2", "--frames", "3", "--width", "64", "--height", "64"]
-    assert main(arguments) == 0
+    assert run(arguments) == 0
     info = json.loads((tmp_path / "ds" / "meta" / "info.json").read_text())
     assert (info["total_episodes"], info["total_frames"]) == (2, 6)
-    assert main(arguments) == 2  # the folder exists
+    with pytest.raises(OutputError, match="exists already"):
+        run(arguments)

@@ -2,10 +2,9 @@
 
 import argparse
 import logging
-import sys
 from pathlib import Path
 
-from lerobot_msdyn.core.errors import MsdynError
+from lerobot_msdyn.core.cli import EXIT_OK, run_command
 from lerobot_msdyn.dataset.video import quiet_encoders
 from lerobot_msdyn.synthetic.choreography import KINDS
 from lerobot_msdyn.synthetic.dataset import write_dataset
@@ -43,26 +42,26 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
+def run(arguments: list[str]) -> int:
+    """Make and write; returns the exit code."""
     quiet_encoders()
     a = _parser().parse_args(arguments)
-    try:
-        count = a.episodes if a.layout == "dataset" else 1
-        scenes = [make_scene(a.kind, a.seed, a.frames, a.width, a.height, a.fps, episode=e) for e in range(count)]
-        if a.layout == "dataset":
-            write_dataset(scenes, f"synthetic/{a.out.name}", a.out, cameras=a.cameras, depth=a.depth)
-        elif a.layout == "nvs":
-            write_nvs_folder(scenes[0], a.out)
-        else:
-            write_iphone_folder(scenes[0], a.out, sway_deg=a.sway_deg)
-    except MsdynError as error:
-        logger.error("%s: %s", type(error).__name__, error)
-        return 2
+    count = a.episodes if a.layout == "dataset" else 1
+    scenes = [make_scene(a.kind, a.seed, a.frames, a.width, a.height, a.fps, episode=e) for e in range(count)]
+    if a.layout == "dataset":
+        write_dataset(scenes, f"synthetic/{a.out.name}", a.out, cameras=a.cameras, depth=a.depth)
+    elif a.layout == "nvs":
+        write_nvs_folder(scenes[0], a.out)
+    else:
+        write_iphone_folder(scenes[0], a.out, sway_deg=a.sway_deg)
     logger.info("wrote %d episode(s) of %d frames to %s", count, a.frames, a.out)
-    return 0
+    return EXIT_OK
+
+
+def main() -> None:
+    """Entry point."""
+    run_command(run)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()
