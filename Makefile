@@ -1,8 +1,8 @@
 # make demo    set everything up and run the main job on a small synthetic dataset
-# make test    set everything up and run the tests
+# make test    set everything up and run the tests but those marked slow; make test-all runs all
 # make lint    formatting, lint and types
 unexport PYTHONDONTWRITEBYTECODE  # torch and lerobot compiled anew at every start would cost more than the tests
-.PHONY: setup demo test lint clean
+.PHONY: setup demo test test-all lint clean
 
 PYTHON ?= $(shell command -v python || command -v python3)
 # one that runs: a version manager's shim may belong to another Python
@@ -24,6 +24,9 @@ demo: setup
 	$(BIN)/python examples/01_demo.py
 
 test: setup
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow" $(TESTS)
+
+test-all: setup
 	$(BIN)/python -m pytest -n 2 --dist loadfile $(TESTS)
 
 lint: setup
