@@ -36,7 +36,7 @@ def test_torchvision_s_own_file_is_found_and_read(
     weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    with pytest.raises(PriorError, match=r"not on this machine; fetch: python -c .*raft_small.*C_T_V2"):
+    with pytest.raises(PriorError, match=r"not on this machine; fetch: python -m lerobot_msdyn.models fetch raft"):
         raft_weights(None)
     path = tmp_path / "hub" / "checkpoints" / Path(Raft_Small_Weights.C_T_V2.url).name
     path.parent.mkdir(parents=True)
