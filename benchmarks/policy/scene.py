@@ -8,7 +8,8 @@ import numpy as np
 from .cameras import FOVY_DEG
 from .forms import Form
 
-BLOCK_HALF_WIDTH_M = 0.013  # as it comes (0.02) a jaw that is 5 mm off lands on it: policies that know its place fail too
+# As it comes (0.02) a jaw that is 5 mm off lands on it: policies that are told its place fail too.
+BLOCK_HALF_WIDTH_M = 0.013
 WRIST_POSITION_M, WRIST_TILT_DEG, WRIST_FOVY_DEG = (0.0, 0.055, -0.03), 25.0, 70.0  # in the gripper's axes
 
 
