@@ -88,11 +88,21 @@ def code_digest() -> str:
 
 
 def recipe_text(config: Recipe) -> str:
-    """The settings as a recipe file, without the user's folders."""
+    """The settings as a recipe file, without the user's folders: of files outside, the names are kept."""
     fields = {item.name for item in dataclasses.fields(Recipe)}
     settings = {key: value for key, value in draccus.encode(config).items() if key in fields}
     settings["priors"].pop("cache")
-    return yaml.safe_dump(settings)
+    return yaml.safe_dump(_without_folders(settings))
+
+
+def _without_folders(settings: Any) -> Any:
+    """Settings with the names alone of files that are given by absolute paths."""
+    if isinstance(settings, dict):
+        return {key: _without_folders(value) for key, value in settings.items()}
+    if isinstance(settings, list):
+        return [_without_folders(value) for value in settings]
+    is_path = isinstance(settings, str) and Path(settings).is_absolute()
+    return Path(settings).name if is_path else settings
 
 
 def _named_files(settings: Any) -> list[Path]:
