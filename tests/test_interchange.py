@@ -186,6 +186,7 @@ def test_push_carries_everything(outputs: tuple[Path, Path], monkeypatch: pytest
     assert {"meta/msdyn/episodes.parquet", "meta/msdyn/recipe.yaml", "meta/info.json", "README.md"} <= sent
     assert calls["card"] == (root / "README.md").read_text()
     assert "3 of the 6 episodes of this dataset are synthetic" in calls["card"]
+    assert "More Information Needed" not in calls["card"]
 
 
 def test_the_trainer_splits_as_planned(outputs: tuple[Path, Path]) -> None:

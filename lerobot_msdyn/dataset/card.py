@@ -17,6 +17,16 @@ from lerobot_msdyn.dataset.provenance import RECIPE, SOURCE_VARIANT, read_proven
 CARD = "README.md"
 MAX_CARD_BYTES = 1 << 20
 TAGS = ["synthetic", "novel-view", "lerobot_msdyn"]
+MADE_BY = "rendered by lerobot_msdyn, a plugin for LeRobot"
+PAPER = "https://arxiv.org/abs/2602.13806 (the method of rendering)"
+CITATION = """\
+@article{li2026gaussian,
+  title   = {Gaussian Sequences with Multi-Scale Dynamics for 4D Reconstruction from Monocular Casual Videos},
+  author  = {Li, Can and Gu, Jie and Chen, Jingmin and Qiu, Fangzhou and Sun, Lei},
+  journal = {arXiv preprint arXiv:2602.13806},
+  year    = {2026}
+}"""
+NO_LICENCE = "unknown"  # the Hub's word for it
 DESCRIPTION = """\
 **{rendered} of the {episodes} episodes of this dataset are synthetic.** Their pictures were not recorded: they were
 rendered by lerobot_msdyn {version} from Gaussian scenes that were fitted to recorded episodes, as seen from cameras
@@ -73,7 +83,14 @@ def card_arguments(root: Path, repo_id: str, licence: str | None = None) -> dict
         repo_id=repo_id,
         recipe=recipe,
     )
-    return {"tags": TAGS, "license": licence or licence_of(root), "dataset_description": description}
+    return {
+        "tags": TAGS,
+        "license": licence or licence_of(root) or NO_LICENCE,
+        "dataset_description": description,
+        "url": MADE_BY,
+        "paper": PAPER,
+        "citation_bibtex": CITATION,
+    }
 
 
 def write_card(root: Path, repo_id: str, licence: str | None = None) -> None:
