@@ -138,7 +138,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--form", choices=FORMS, default="reduced")
     parser.add_argument("--policy", choices=("small", "act"), default="small")
-    parser.add_argument("--rows", type=lambda text: text.split(";"), default=list(ROWS), help="; between them")
+    parser.add_argument("--rows", type=lambda text: text.split(";"), default=list(ROWS), help="; between them; those of sweeps, too")
     parser.add_argument("--sweep", choices=SWEEPS, help="rows of this sweep beside transforms and oracle")
     parser.add_argument("--steps", type=int, default=0, help="gradient steps; 0: the form's")
     parser.add_argument("--seeds", type=int, default=0, help="trainings per row; 0: the form's")
@@ -146,10 +146,11 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--pictures", action="store_true", help="compare the product's pictures with exact ones alone")
     parser.add_argument("--report", action="store_true", help="print the table of what is finished, and stop")
     options = parser.parse_args(arguments)
-    unknown = sorted(set(options.rows) - set(ROWS))
+    known = ROWS | {name: row for sweep in SWEEPS.values() for name, row in sweep.items()}
+    unknown = sorted(set(options.rows) - set(known))
     if unknown:
-        parser.error(f"--rows has {unknown}; expected some of {list(ROWS)}")
-    rows = {name: ROWS[name] for name in options.rows}
+        parser.error(f"--rows has {unknown}; expected some of {list(known)}")
+    rows = {name: known[name] for name in options.rows}
     if options.sweep:
         rows = {name: ROWS[name] for name in ("transforms", "oracle")} | SWEEPS[options.sweep]
     form = FORMS[options.form]

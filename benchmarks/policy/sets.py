@@ -104,9 +104,15 @@ class Sets:
 
     def random_poses(self, episode: int) -> list[np.ndarray]:
         """The level poses of the oracle and of the homography."""
-        form, rng = self.form, np.random.default_rng([episode, 21])
-        bounds = form.range_deg, form.range_deg / 3, form.range_m
-        return [random_placement(rng, *bounds).world_from_camera() for _ in range(form.variants)]
+        return self._poses(np.random.default_rng([episode, 21]), self.form.variants)
+
+    def frame_poses(self, episode: int, variant: int, count: int) -> list[np.ndarray]:
+        """Level poses for single frames, of the same spread."""
+        return self._poses(np.random.default_rng([episode, 21, variant]), count)
+
+    def _poses(self, rng: np.random.Generator, count: int) -> list[np.ndarray]:
+        bounds = self.form.range_deg, self.form.range_deg / 3, self.form.range_m
+        return [random_placement(rng, *bounds).world_from_camera() for _ in range(count)]
 
 
 def recorded(sets: Sets, path: Path) -> None:
@@ -119,6 +125,19 @@ def oracle(sets: Sets, path: Path) -> None:
     """With each episode, exact pictures of it from random level poses."""
     poses = [[Placement().world_from_camera(), *sets.random_poses(i)] for i in range(sets.form.episodes)]
     _write_rendered(sets, path, poses)
+
+
+def oracle_per_frame(sets: Sets, path: Path) -> None:
+    """As `oracle`, with a random pose for every frame."""
+
+    def episodes() -> Iterator[Episode]:
+        for index, one in enumerate(sets.demonstrations()):
+            yield one, sets.rendered(one, Placement().world_from_camera())
+            for variant in range(sets.form.variants):
+                poses = sets.frame_poses(index, variant, len(one.qpos))
+                yield one, (sets.scene.pictures(*state)[0] for state in zip(one.qpos, poses, strict=True))
+
+    sets.write(path, episodes())
 
 
 def _write_rendered(sets: Sets, path: Path, poses: list[list[np.ndarray]]) -> None:
@@ -229,6 +248,7 @@ SWEEPS: dict[str, dict[str, Row]] = {
     "range": _swept("range", "perturbation.azimuth_deg", (5, 10, 15, 20, 30)),
     "sampling": {
         "one pose per episode": ROWS["product"],
+        "oracle, one pose per frame": Row("oracle_per_frame", oracle_per_frame),
         "one pose per frame": Row(
             "product_per_frame", partial(product, flags=(WITHOUT_JOINTS, "--perturbation.per_frame=true"))
         ),
