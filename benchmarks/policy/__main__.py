@@ -138,7 +138,8 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--form", choices=FORMS, default="reduced")
     parser.add_argument("--policy", choices=("small", "act"), default="small")
-    parser.add_argument("--rows", type=lambda text: text.split(";"), default=list(ROWS), help="; between them; those of sweeps, too")
+    of_rows = "; between them; those of sweeps, too"
+    parser.add_argument("--rows", type=lambda text: text.split(";"), default=list(ROWS), help=of_rows)
     parser.add_argument("--sweep", choices=SWEEPS, help="rows of this sweep beside transforms and oracle")
     parser.add_argument("--steps", type=int, default=0, help="gradient steps; 0: the form's")
     parser.add_argument("--seeds", type=int, default=0, help="trainings per row; 0: the form's")
