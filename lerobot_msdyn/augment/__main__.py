@@ -148,6 +148,7 @@ def augment(
     from lerobot_msdyn.augment.robot_cameras import publish
     from lerobot_msdyn.augment.run import run_local
     from lerobot_msdyn.augment.run_identity import recipe_text
+    from lerobot_msdyn.augment.workers import terse
     from lerobot_msdyn.dataset.provenance import CALIBRATION, FOLDER, SOURCE_VARIANT
     from lerobot_msdyn.dataset.training_command import training_command
     from lerobot_msdyn.dataset.write import OutputDataset
@@ -160,7 +161,8 @@ def augment(
     check_disk(source, episodes, config, staging.folder)
     with OutputDataset(source, new_repo_id, new_root, staging, nvenc=config.nvenc) as output:
         output.check(cameras, depth=config.render_depth)
-        made, failures = run_local(source, episodes, cameras, config, output)
+        with terse(config):
+            made, failures = run_local(source, episodes, cameras, config, output)
         new = [episode for episode in made if not episode.dropped]
         skipped = one_line_each(source.repo_id, failures) + _lost(config, source)
         dropped = [f"episode {e.source_index} variant {e.provenance.variant}: {e.dropped}" for e in made if e.dropped]

@@ -4,7 +4,7 @@ import contextlib
 import functools
 import logging
 import sys
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator
 from dataclasses import replace
 
 import torch
@@ -24,7 +24,7 @@ from lerobot_msdyn.augment.episode import augment_episode
 from lerobot_msdyn.augment.failures import same_reason
 from lerobot_msdyn.augment.robot_cameras import calibrated
 from lerobot_msdyn.augment.run_identity import source_folder
-from lerobot_msdyn.augment.workers import Work, Workers, quieten_stages, threads_of_one, workers_for
+from lerobot_msdyn.augment.workers import Work, Workers, threads_of_one, workers_for
 from lerobot_msdyn.core.errors import EpisodeError, MsdynError
 from lerobot_msdyn.dataset.convert import named_as_given
 from lerobot_msdyn.dataset.provenance import CALIBRATION
@@ -45,27 +45,6 @@ def run_local(
     output: OutputDataset,
 ) -> tuple[list[NewEpisode], dict[int, str]]:
     """All episodes on this machine, and why some failed: they are left out, and every reason is logged once."""
-    with _terse(config):
-        return _run_local(source, episodes, cameras, config, output)
-
-
-@contextlib.contextmanager
-def _terse(config: AugmentConfig) -> Iterator[None]:
-    before = [] if config.verbose else quieten_stages()
-    try:
-        yield
-    finally:
-        for each, level in before:
-            each.setLevel(level)
-
-
-def _run_local(
-    source: LeRobotDatasetMetadata,
-    episodes: list[int],
-    cameras: list[str],
-    config: AugmentConfig,
-    output: OutputDataset,
-) -> tuple[list[NewEpisode], dict[int, str]]:
     chosen_device(config.device)  # complains, or says what is used, before anything is done
     problems = {index: files_problem(source, index) for index in episodes}  # known before minutes of work
     whole = [index for index in episodes if not problems[index]]

@@ -144,8 +144,8 @@ def _begin(place: _Place, threads: int, progress: Progress) -> Work:
     for said_by_parent in (chosen_device, open_source):
         logging.getLogger(said_by_parent.__module__).setLevel(logging.ERROR)
     config = _config_at(place)
-    if not config.verbose:
-        quieten_stages()
+    for each in _talkative(config):
+        each.setLevel(logging.WARNING)
     tqdm.set_lock(threading.RLock())  # its own is for several processes, and left behind by one that ends at once
     torch.set_num_threads(threads)
     cv2.setNumThreads(threads)
@@ -156,13 +156,23 @@ def _begin(place: _Place, threads: int, progress: Progress) -> Work:
     return Work(source, place.cameras, config, output, progress)
 
 
-def quieten_stages() -> list[tuple[logging.Logger, int]]:
-    """From now on stages say only what is wrong; returns their loggers with the levels that they had."""
-    loggers = [logging.getLogger(f"lerobot_msdyn.{name}") for name in STAGES]
-    before = [(each, each.level) for each in loggers]
+@contextlib.contextmanager
+def terse(config: AugmentConfig) -> Iterator[None]:
+    """Within, stages say only what is wrong, unless the settings ask for more."""
+    loggers = _talkative(config)
+    before = [each.level for each in loggers]
     for each in loggers:
         each.setLevel(logging.WARNING)
-    return before
+    try:
+        yield
+    finally:
+        for each, level in zip(loggers, before, strict=True):
+            each.setLevel(level)
+
+
+def _talkative(config: AugmentConfig) -> list[logging.Logger]:
+    """Loggers of the stages that are to say less."""
+    return [] if config.verbose else [logging.getLogger(f"lerobot_msdyn.{name}") for name in STAGES]
 
 
 def _with_source(work: Work, call: tuple[Callable[[LeRobotDatasetMetadata, MaskTask], object], MaskTask]) -> object:
