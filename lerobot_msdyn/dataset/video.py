@@ -25,6 +25,7 @@ logger = logging.getLogger(__name__)
 
 NVENC = {"h264": "h264_nvenc", "hevc": "hevc_nvenc"}  # LeRobot's encoders: on the processor, and on an NVIDIA GPU
 SVT_LOG, SVT_ERRORS = "SVT_LOG", "1"  # how much the AV1 encoder writes to stderr; read when it is opened
+X265, X265_PARAMS, X265_LOG = {"hevc", "libx265"}, "x265-params", "log-level"
 MAX_LEVEL_ERROR = 16  # of 255; coding changes a frame's mean brightness by less than 2, an empty frame by more
 
 
@@ -149,7 +150,7 @@ class VideoFile:
         else:
             frame = _depth_frame(picture, self._encoder)
         if self._stream is None:
-            options = self._encoder.get_codec_options(as_strings=True)
+            options = _quiet(self._encoder.vcodec, self._encoder.get_codec_options(as_strings=True))
             self._stream = self._container.add_stream(self._encoder.vcodec, self._rate, options=options)
             self._stream.pix_fmt = self._encoder.pix_fmt
             self._stream.width, self._stream.height = frame.width, frame.height
@@ -165,6 +166,14 @@ class VideoFile:
         if self._stream is not None:
             self._container.mux(self._stream.encode())
         self._container.close()
+
+
+def _quiet(codec: str, options: dict[str, str]) -> dict[str, str]:
+    """Options of an encoder that logs nothing but errors: x265 asks nobody but its own parameters."""
+    params = options.get(X265_PARAMS, "")
+    if codec not in X265 or X265_LOG in params:
+        return options
+    return options | {X265_PARAMS: ":".join(filter(None, (params, f"{X265_LOG}=error")))}
 
 
 def _depth_frame(depth: np.ndarray, encoder: RGBEncoderConfig | DepthEncoderConfig) -> av.VideoFrame:

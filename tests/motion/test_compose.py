@@ -168,3 +168,55 @@ def test_every_gaussian_moves_rigidly_at_its_centre() -> None:
     R = quaternion_to_matrix(q[0])
     torch.testing.assert_close(R @ R.transpose(1, 2), torch.eye(3).expand(5, 3, 3), atol=1e-5, rtol=0)
     torch.testing.assert_close(torch.linalg.det(R), torch.ones(5), atol=1e-5, rtol=0)
+
+
+def carried_and_gradients(level: MotionLevel, kind: torch.dtype) -> list[Tensor]:
+    """What 3 bases of each point make of it in the given precision, and the gradients of all that is learned."""
+    cast = {name: getattr(level, name).to(kind) for name in ("knots", "pivots", "reach")}
+    learned = {name: getattr(level, name).to(kind, copy=True) for name in ("rotations_6d", "displacements")}
+    for each in learned.values():
+        each.requires_grad_()
+    level = dataclasses.replace(level, **cast, **learned)
+    generator = torch.Generator().manual_seed(4)
+    n, times = 5000, torch.tensor([0, 2, 1])
+    indices = torch.randint(len(level), (n, 3), generator=generator)
+    logits, points = (torch.randn(n, 3, generator=generator).to(kind).requires_grad_() for _ in range(2))
+    quats = torch.randn(n, 4, generator=generator).to(kind).requires_grad_()
+    x, q = level.carry(points.expand(3, -1, -1), quats.expand(3, -1, -1), indices, logits, times)
+    towards = torch.randn(3, n, 4, generator=generator).to(kind)
+    turned = (q * towards).sum(-1).square()  # of a quaternion the sign is free
+    ((x * towards[..., :3]).sum() + turned.sum()).backward()
+    given = (*learned.values(), logits, points, quats)
+    return [x, turned, *(each.grad for each in given if each.grad is not None)]
+
+
+def test_the_compiled_route_equals_torch_in_double_precision() -> None:
+    level = random_level(6, 3, 7)
+    compiled, plain = carried_and_gradients(level, torch.float32), carried_and_gradients(level, torch.float64)
+    assert len(compiled) == len(plain) == 7
+    for one, other in zip(compiled, plain, strict=True):
+        torch.testing.assert_close(one.double(), other, atol=3e-5 * float(other.detach().abs().max()), rtol=0)
+    points = torch.randn(2, 5000, 3)
+    indices, logits, times = torch.randint(6, (5000, 2)), torch.randn(5000, 2), torch.tensor([1, 2])
+    both = level.carry(points, torch.randn(2, 5000, 4), indices, logits, times)[0]
+    assert torch.equal(level.carry_points(points, indices, logits, times), both)
+
+
+def test_opposite_bases_have_the_same_gradients_by_both_routes() -> None:
+    """Where blended rotations cancel out, the heaviest basis alone turns the point and learns from it."""
+    still = torch.eye(4)
+    motions = torch.stack((still, turn_about(torch.zeros(3), torch.tensor([math.pi, 0.0, 0.0]))))
+    gradients = []
+    for kind in (torch.float32, torch.float64):
+        level = level_from_motions(motions[:, None].to(kind), torch.zeros(2, 3, dtype=kind))
+        sixd = level.rotations_6d.clone().requires_grad_()
+        level = dataclasses.replace(level, rotations_6d=sixd)
+        quats = torch.tensor([[0.5, 0.1, -0.7, 0.4]], dtype=kind)
+        points = torch.tensor([[0.1, 0.2, 0.3]], dtype=kind)
+        logits = torch.tensor([[0.0, 1e-5]], dtype=kind)
+        _, q = level.carry(points[None], quats[None], torch.tensor([[0, 1]]), logits, torch.tensor([0]))
+        (q * torch.tensor([0.3, -0.2, 0.9, 0.4], dtype=kind)).sum().square().backward()
+        assert sixd.grad is not None
+        assert bool((sixd.grad[0] == 0).all())
+        gradients.append(sixd.grad.double())
+    torch.testing.assert_close(*gradients, atol=1e-5, rtol=0)

@@ -14,9 +14,9 @@ from lerobot_msdyn.core.geometry import (
     quaternion_multiply,
     rotation_6d_to_matrix,
 )
+from lerobot_msdyn.motion.model.carried import DEGENERATE, carried, carried_points
 
 COARSEST = -1  # the parent of a basis that nothing carries
-_DEGENERATE = 1e-3  # area spanned by the first two columns of a blend, below which it has no direction left
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,8 @@ class MotionLevel:
         if not self._moves:
             return positions, orientations
         affines = level_affines(self, times)
+        if _compiled(affines, positions):
+            return carried(affines, torch.softmax(logits, dim=-1), indices, positions, orientations)
         blended = blend(affines, indices, logits)
         rotations = _nearest_rotations(blended, affines, indices, logits)
         turned = quaternion_multiply(matrix_to_quaternion(rotations), orientations)
@@ -72,7 +74,14 @@ class MotionLevel:
         """Positions (m) as `carry` moves them, without orientations, which take most of its time."""
         if not self._moves:
             return positions
-        return _applied(blend(level_affines(self, times), indices, logits), positions)
+        affines = level_affines(self, times)
+        if _compiled(affines, positions):
+            return carried_points(affines, torch.softmax(logits, dim=-1), indices, positions)
+        return _applied(blend(affines, indices, logits), positions)
+
+
+def _compiled(affines: Tensor, positions: Tensor) -> bool:
+    return affines.dtype == positions.dtype == torch.float32 and not affines.is_cuda
 
 
 def _applied(maps: Float[Tensor, "b n 3 4"], points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 3"]:
@@ -168,7 +177,7 @@ def _nearest_rotations(
 ) -> Float[Tensor, "b n 3 3"]:
     """Rotations of blended maps; where opposite rotations cancel out, that of the heaviest basis."""
     first, second = blended[..., 0], blended[..., 1]
-    degenerate = torch.linalg.cross(first, second).norm(dim=-1, keepdim=True) < _DEGENERATE
+    degenerate = torch.linalg.cross(first, second).norm(dim=-1, keepdim=True) < DEGENERATE
     columns = torch.cat((first, second), dim=-1)
     if degenerate.is_cuda or degenerate.any():  # on a GPU, waiting for the answer takes longer
         heaviest = indices.gather(1, logits.argmax(dim=1, keepdim=True))[:, 0]
