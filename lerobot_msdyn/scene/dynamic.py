@@ -6,11 +6,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lerobot_msdyn.core.geometry import quaternion_conjugate, quaternion_multiply, quaternion_to_matrix
 from lerobot_msdyn.core.serialise import named_tensors
 from lerobot_msdyn.motion.model.compose import Level, compose, compose_points
-from lerobot_msdyn.scene.gaussians import Gaussians, shaded
+from lerobot_msdyn.scene.gaussians import Gaussians
 from lerobot_msdyn.scene.overlay import PATCH_OPACITY, FramePatch, Overlay
+from lerobot_msdyn.scene.seen import shaded_moving
 from lerobot_msdyn.scene.shading import Shading
 
 
@@ -117,9 +117,7 @@ class DynamicScene:
         static = self.static.rgb.expand(len(frames), -1, -1)
         moving = self.moving.rgb.expand(len(frames), -1, -1)
         if eye is not None and self.moving.sh.shape[1] > 1:
-            back = quaternion_multiply(self.moving.quats, quaternion_conjugate(quats))
-            sight = torch.nn.functional.normalize(means - eye[:, None], dim=-1)
-            moving = shaded(self.moving.sh, (quaternion_to_matrix(back) @ sight[..., None])[..., 0])
+            moving = shaded_moving(self.moving.sh, self.moving.quats, quats, means, eye)
         if self.shading is not None:
             static = static * self.shading.static_gain(frames)[..., None]
             moving = moving * self.shading.moving_gain(frames)[..., None]

@@ -120,11 +120,8 @@ def _columns(
     return single[0], single[4], single[8], single[1], single[5], single[9], basis
 
 
-
 @inlined
-def _blended(
-    map_: ndarray, affines: ndarray, weights: ndarray, indices: ndarray, time: int, point: int
-) -> None:
+def _blended(map_: ndarray, affines: ndarray, weights: ndarray, indices: ndarray, time: int, point: int) -> None:
     """The mixed map of a point, row by row, into `map_` [12]."""
     for entry in range(12):
         map_[entry] = 0.0
@@ -132,7 +129,6 @@ def _blended(
         weight = weights[point, slot]
         for entry in range(12):
             map_[entry] += weight * affines[indices[point, slot], time, entry]
-
 
 
 @inlined
@@ -144,7 +140,6 @@ def _frame(a0: float, a1: float, a2: float, b0: float, b1: float, b2: float) -> 
     u0, u1, u2 = b0 - along * x0, b1 - along * x1, b2 - along * x2
     rest = max(math.sqrt(u0 * u0 + u1 * u1 + u2 * u2), 1e-12)
     return x0, x1, x2, u0 / rest, u1 / rest, u2 / rest, length, along, rest
-
 
 
 @inlined
@@ -164,7 +159,6 @@ def _quaternion(x0: float, x1: float, x2: float, y0: float, y1: float, y2: float
     return (x1 - y0) / s, (z0 + x2) / s, (z1 + y2) / s, 0.25 * s
 
 
-
 @inlined
 def _product(
     pw: float, px: float, py: float, pz: float, qw: float, qx: float, qy: float, qz: float
@@ -176,7 +170,6 @@ def _product(
         pw * qy - px * qz + py * qw + pz * qx,
         pw * qz + px * qy - py * qx + pz * qw,
     )
-
 
 
 @compiled
@@ -213,7 +206,6 @@ def _forward(
                 turned[time, point, 0], turned[time, point, 1] = rw, rx
                 turned[time, point, 2], turned[time, point, 3] = ry, rz
         ticket = take_ticket(tickets)
-
 
 
 @compiled
