@@ -24,7 +24,7 @@ from lerobot_msdyn.motion.from_tracks.parts import split_rigid_parts
 from lerobot_msdyn.motion.model.bases import MotionLevel
 from lerobot_msdyn.motion.model.compose import Level
 from lerobot_msdyn.motion.model.scene_motion import SceneMotion
-from lerobot_msdyn.motion.spec import FirstLevel, PartTracks, first_level, frames_per_knot
+from lerobot_msdyn.motion.spec import FirstLevel, PartTracks, finer_level, first_level, frames_per_knot
 from lerobot_msdyn.motion.to_video.register import Recording
 
 _MIN_SEEN = 3  # frames, and 5 % of the clip, in which a track must be seen
@@ -118,10 +118,20 @@ def _with_finer_levels(
     noise: float,
     by_video: Callable[[SceneMotion, str], Approve | None],
 ) -> SceneMotion:
-    """The motion with all levels that the config names; `left` are the tracks as the first one leaves them."""
+    """The motion with the levels that the config names; `left` are the tracks as the first one leaves them.
+
+    A level that is refused in all parts is left out, and with it those that would refine it.
+    """
+    refused = False
     for name in config.levels[1:]:
+        if refused and finer_level(name).refines:
+            continue
         so_far = replace(motion, points=left.points)
-        level, left = add_level(name, left, tracks, so_far, config, noise, by_video(motion, name))
+        level, left_by_it = add_level(name, left, tracks, so_far, config, noise, by_video(motion, name))
+        refused = not bool(level.active.any())
+        if refused:
+            continue
+        left = left_by_it
         motion = SceneMotion(
             (*motion.names, name),
             (*motion.levels, level),

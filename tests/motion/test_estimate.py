@@ -53,11 +53,11 @@ def by_levels(deformable: TrackedBody) -> dict[str, SceneMotion]:
 
 
 def test_each_level_explains_more_of_a_deformation(deformable, by_levels) -> None:
-    object_, primitive, grain, particle = (error_mm(by_levels[name], deformable) for name in by_levels)
+    object_, primitive, grain = (error_mm(by_levels[name], deformable) for name in by_levels)
     assert object_ > 1.5 * primitive
     assert primitive > 1.2 * grain
     assert grain < 1.3
-    assert particle < 1.1 * grain
+    assert "particle" not in by_levels  # explains nothing that is left, and is refused
 
 
 def test_the_gate_keeps_what_proves_itself(by_levels) -> None:
@@ -70,7 +70,7 @@ def test_the_gate_keeps_what_proves_itself(by_levels) -> None:
 def test_a_rigid_body_gets_no_finer_levels() -> None:
     body = tracked_body("rigid")
     motion = fitted(body, "object", "primitive", "grain")
-    assert [bool(level.active.any()) for level in of_bases(motion.levels)] == [True, False, False]
+    assert motion.names == ("object",)
     assert error_mm(motion, body) < 0.3
     assert error_mm(fitted(body, "object", "primitive", "grain", gate=False), body) > error_mm(motion, body)
 
