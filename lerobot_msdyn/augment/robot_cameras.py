@@ -17,8 +17,7 @@ from lerobot.utils.constants import OBS_STATE
 from numpy import ndarray
 
 from lerobot_msdyn.augment.backgrounds import looked_at
-from lerobot_msdyn.augment.config import AugmentConfig
-from lerobot_msdyn.core.config import RobotConfig
+from lerobot_msdyn.core.config import Recipe, RobotConfig
 from lerobot_msdyn.core.errors import ConfigError, DatasetError, EpisodeError, PriorError
 from lerobot_msdyn.core.files import cache_folder, write_whole
 from lerobot_msdyn.core.sampling import REFERENCE_WIDTH, evenly
@@ -125,13 +124,9 @@ class RobotCameras:
         return RobotRecord(urdf, self.robot.licence, corrected, self.robot.movable, solution.lag_s).entry()
 
 
-def calibrated(
-    source: LeRobotDatasetMetadata,
-    episodes: Sequence[int],
-    cameras: Sequence[str],
-    config: AugmentConfig,
-    folder: Path,
-) -> AugmentConfig:
+def calibrated[R: Recipe](
+    source: LeRobotDatasetMetadata, episodes: Sequence[int], cameras: Sequence[str], config: R, folder: Path
+) -> R:
     """The settings with a calibration file, where there is none yet and the robot's joints tell where cameras stand.
 
     The file, and pictures of the links over the video, are written to a folder; they are used if they are there before.
@@ -173,7 +168,7 @@ def publish(folder: Path, place: Path) -> None:
         write_whole(place / NAME, json.dumps(content, indent=1).encode())
 
 
-def calibration_episodes(source: LeRobotDatasetMetadata, config: AugmentConfig) -> list[int]:
+def calibration_episodes(source: LeRobotDatasetMetadata, config: Recipe) -> list[int]:
     """The episodes that tell where cameras stand, beside those that are worked on; none where that is known."""
     wanted = config.camera.by_robot and config.camera.calibration is None
     return looked_at(source.total_episodes) if wanted else []

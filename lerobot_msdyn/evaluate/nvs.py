@@ -17,6 +17,7 @@ from jaxtyping import Int, UInt8
 from numpy import ndarray
 from torch import Tensor
 
+from lerobot_msdyn.augment.robot_cameras import calibrated
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.errors import DatasetError
 from lerobot_msdyn.core.observations import View
@@ -37,7 +38,10 @@ from lerobot_msdyn.evaluate.scores import (
 )
 from lerobot_msdyn.evaluate.timing import timed, timed_reconstruction
 from lerobot_msdyn.reconstruction.result import Reconstruction
+from lerobot_msdyn.robots.seen import through
 from lerobot_msdyn.views.pictures import new_pictures
+
+ROBOT = "robot"  # folder of the output for what the robot's joints tell of the camera
 
 
 def evaluate_nvs(config: EvaluateConfig) -> Evaluated:
@@ -112,14 +116,20 @@ def _at_fitted_scale(
 
 
 def read_view(config: EvaluateConfig) -> View:
-    """The recorded video with its true camera; with recorded depth where that is asked for."""
+    """The recorded video with its true camera; with recorded depth where that is asked for.
+
+    What a robot's joints tell of the camera, as in the job, is told of its links alone.
+    """
     folder, recorded = config.scene_folder, config.depth == "recorded"
     train = _arrays(folder / "gt" / "train.npz", ("K", "c2w"))
     source = open_source(f"local/{folder.name}", folder / ("dataset_depth" if recorded else "dataset"))
     key = select_cameras(source, config.cameras)[0]
-    view = read_episode(source, 0, [key], config.camera, recorded_depth=recorded).views[key]
+    found = calibrated(source, [0], [key], config, config.out / ROBOT)
+    view = read_episode(source, 0, [key], found.camera, recorded_depth=recorded).views[key]
     height, width = view.rgb.shape[1:3]
-    return replace(view, camera=_track(train, width, height))
+    camera = _track(train, width, height)
+    robot = None if view.robot is None or not camera.is_static else through(view.robot, view.camera, camera)
+    return replace(view, camera=camera, robot=robot)
 
 
 def read_truth(folder: Path, camera: str) -> TrueViews | None:

@@ -11,6 +11,7 @@ from lerobot_msdyn.core.config import CameraConfig, Device, PriorsConfig
 from lerobot_msdyn.core.observations import Origin, Priors, View
 from lerobot_msdyn.priors.cache import open_cache
 from lerobot_msdyn.priors.camera.field_of_view import with_searched_fov
+from lerobot_msdyn.priors.depth.lying import with_lying
 from lerobot_msdyn.priors.from_file import CameraFile, DepthFile, MaskFile, TrackFile
 from lerobot_msdyn.priors.provide import provide
 from lerobot_msdyn.priors.registry import CameraProvider, DepthProvider, MaskProvider, Masks, TrackProvider
@@ -64,6 +65,8 @@ def estimate_priors(
     tracks, tracks_from = provide(
         TrackProvider, config.tracks, posed, lambda provider: provider.estimate(posed, instances), file=TrackFile
     )
+    if pinhole.is_static:
+        depth = with_lying(depth, instances, tracks, pinhole)
     if view.robot is not None:
         depth = with_robot_depth(depth, instances, view.robot, robot)
     if camera.fov_search:

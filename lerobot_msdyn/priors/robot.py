@@ -15,6 +15,7 @@ from lerobot_msdyn.priors.registry import Depth, Masks
 
 RELATIVE_ERROR = 0.03  # of depth by a calibrated robot
 BESIDE_PX = 4.0  # of 320: so far from the robot's pixels a mask may still be the robot's
+SAME_DEPTH = 0.05  # share by which a thing and the link that touches it may differ
 TOUCHING_PX = 1.5  # of 320: no farther apart are things that touch
 LEAST_TOUCHED = 8  # pixels
 LEAST_PX = 6.0  # of 320: side of the smallest thing that touches the robot
@@ -65,14 +66,24 @@ def with_robot_depth(depth: Depth, instances: Masks, robot: RobotSeen, label: in
 def _held(
     others: UInt8[Tensor, "h w"], links: Float[Tensor, "h w"], depth: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w"]:
-    """Depth (m) in which instances that touch links (m, 0 = none) are as far away as these."""
+    """Depth (m) in which instances that touch links (m, 0 = none) are as far away as these where they touch them.
+
+    What is about as far away already stays where it is: it may stand on the table.
+    """
     window = np.ones((2 * max(1, round(scaled_px(TOUCHING_PX, others.shape[1]))) + 1,) * 2, np.uint8)
     for index in others.unique().tolist():
         its = others == index
         grown = torch.from_numpy(cv2.dilate(its.numpy().astype(np.uint8), window) > 0)
         touched = links[grown & (links > 0)]
-        if index and len(touched) >= LEAST_TOUCHED:
+        if not index or len(touched) < LEAST_TOUCHED:
+            continue
+        beside = torch.from_numpy(cv2.dilate((links > 0).numpy().astype(np.uint8), window) > 0) & its & (depth > 0)
+        if not bool(beside.any()):
             depth = torch.where(its, touched.median(), depth)
+            continue
+        factor = touched.median() / depth[beside].median()
+        if abs(float(factor.log())) > SAME_DEPTH:
+            depth = torch.where(its, factor * depth, depth)
     return depth
 
 

@@ -1,5 +1,6 @@
 """What a calibrated camera sees of a robot."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.geometry import transform_points
 from lerobot_msdyn.core.observations import BodyTracks, Model, RobotSeen
 from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.robots.calibration.contours import Posed
@@ -53,6 +55,31 @@ def robot_seen(
     model = Model(robot.name, licence=robot.licence)
     bodies = _bodies(posed, moves, pose, depth)
     return RobotSeen(torch.from_numpy(depth), torch.from_numpy(moving), bodies, ground, model)
+
+
+def through(seen: RobotSeen, told: CameraTrack, known: CameraTrack) -> RobotSeen:
+    """What a robot's joints say of a video whose true camera is known: in its world, each point at the same pixel.
+
+    Where the camera that the joints tell has another focal length, its distances are off by the same factor.
+
+    Args:
+        seen: as the joints tell it.
+        told: the fixed camera that they tell.
+        known: the true one, fixed as well.
+    """
+    factor = known.intrinsics[0, 0, 0] / told.intrinsics[0, 0, 0]
+    to_known = factor * torch.linalg.inv(known.intrinsics[0]) @ told.intrinsics[0]
+
+    def moved(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        in_camera = transform_points(told.camera_from_world[0], points) @ to_known.T
+        return transform_points(known.world_from_camera[0], in_camera)
+
+    pose = told.world_from_camera[0]
+    ahead = (seen.ground_m - pose[2, 3]) / pose[2, 2].clamp(max=-1e-3)  # along the line of sight, to the ground
+    ground = moved((pose[:3, 3] + ahead * pose[:3, 2])[None])[0, 2]
+    xyz = moved(seen.bodies.xyz.flatten(0, 1)).reshape(seen.bodies.xyz.shape)
+    bodies = replace(seen.bodies, xyz=xyz)
+    return replace(seen, depth=factor * seen.depth, bodies=bodies, ground_m=float(ground))
 
 
 def _bodies(posed: Posed, moves: Bool[ndarray, " l"], pose: Pose, depth: Float32[ndarray, "t h w"]) -> BodyTracks:

@@ -63,7 +63,12 @@ def test_depth_of_the_robot_and_of_what_it_holds() -> None:
     assert bool((z[:, *ARM] == 1).all())
     assert bool((z[:, *BASE] == 1.2).all())
     assert bool((z[:, 10:35, 29] == 1).all())
-    assert bool((z[2, 10:20, 46:58] == 1).all())
+    torch.testing.assert_close(z[2, 10:20, 46:58], torch.ones(10, 12))
     assert float(z[0, 15, 65]) == 3
+    sloped = plane * torch.linspace(1.0, 1.2, WIDTH)
+    held = with_robot_depth(Depth(sloped, DepthTraits()), found, robot(), label).z[2, 10:20, 46:58]
+    torch.testing.assert_close(held / held[:, :1], sloped[2, 10:20, 46:58] / sloped[2, 10:20, 46:47])
+    near = with_robot_depth(Depth(plane / 2.9, DepthTraits()), found, robot(), label).z
+    assert bool((near[2, 10:20, 46:58] == plane[0, 0, 0] / 2.9).all())
     measured = Depth(plane, DepthTraits(metric=True, sharp=True))
     assert torch.equal(with_robot_depth(measured, found, robot(), label).z, plane)

@@ -60,7 +60,7 @@ def in_metres(
             shifted=kind == AFFINE_DISPARITY,
             known=not reference.traits.assumed,
         )
-        return _clean(z, true_metres, how)
+        return _clean(z, true_metres, how, reference.ground)
     usable = None if reference.traits.measured else instances == 0
     align = align_disparity if kind == AFFINE_DISPARITY else align_scale
     return _clean(align(values, reference.z, usable), true_metres, how)
@@ -81,5 +81,7 @@ def _inverse(values: Float[Tensor, "n h w"], kind: str) -> Float[Tensor, "n h w"
     return values if kind == AFFINE_DISPARITY else torch.where(values > 0, values, torch.nan).reciprocal()
 
 
-def _clean(z: Float[Tensor, "t h w"], true_metres: bool, how: str) -> Estimate[Depth]:
-    return Estimate(Depth(without_flying_pixels(sharpened(z)), DepthTraits(true_metres)), how)
+def _clean(
+    z: Float[Tensor, "t h w"], true_metres: bool, how: str, ground: Float[Tensor, "h w"] | None = None
+) -> Estimate[Depth]:
+    return Estimate(Depth(without_flying_pixels(sharpened(z)), DepthTraits(true_metres), ground), how)
