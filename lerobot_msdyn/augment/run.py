@@ -4,7 +4,7 @@ import contextlib
 import functools
 import logging
 import sys
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from dataclasses import replace
 
 import torch
@@ -37,6 +37,32 @@ logger = logging.getLogger(__name__)
 UNWATCHED_S = 30.0  # between updates of a progress bar that nobody watches
 
 
+def prepared(
+    source: LeRobotDatasetMetadata,
+    episodes: list[int],
+    cameras: list[str],
+    config: AugmentConfig,
+    output: OutputDataset,
+) -> tuple[AugmentConfig, dict[int, str]]:
+    """What is found out once, before any work: the settings with where cameras stand, and what no file is there for.
+
+    The second is why an episode cannot be read, by its number, as far as that is seen without opening its files.
+    """
+    chosen_device(config.device)  # complains, or says what is used, before anything is done
+    problems = problems_of(source, episodes)
+    whole = [index for index in episodes if index not in problems]
+    if whole:
+        config = calibrated(source, whole, cameras, config, output.staging.folder / CALIBRATION)
+    _say_what_is_assumed(source, cameras, config)
+    return config, problems
+
+
+def problems_of(source: LeRobotDatasetMetadata, episodes: Iterable[int]) -> dict[int, str]:
+    """Why episodes cannot be read, as far as that is seen without opening their files."""
+    problems = {index: files_problem(source, index) for index in episodes}
+    return {index: problem for index, problem in problems.items() if problem}
+
+
 def run_local(
     source: LeRobotDatasetMetadata,
     episodes: list[int],
@@ -45,13 +71,7 @@ def run_local(
     output: OutputDataset,
 ) -> tuple[list[NewEpisode], dict[int, str]]:
     """All episodes on this machine, and why some failed: they are left out, and every reason is logged once."""
-    chosen_device(config.device)  # complains, or says what is used, before anything is done
-    problems = {index: files_problem(source, index) for index in episodes}  # known before minutes of work
-    whole = [index for index in episodes if not problems[index]]
-    if whole:
-        config = calibrated(source, whole, cameras, config, output.staging.folder / CALIBRATION)
-    _say_what_is_assumed(source, cameras, config)
-    new: list[NewEpisode] = []
+    config, problems = prepared(source, episodes, cameras, config, output)
     failures: dict[int, str] = {}
     reasons: set[str] = set()
     bar_format = "{desc} |{bar}| {percentage:3.0f} % of {total} episodes [{elapsed}<{remaining}]"
@@ -66,19 +86,32 @@ def run_local(
 
         bar.set_description_str("looking at the background", refresh=watched)
         work = Work(source, cameras, config, output, progress)
-        with contextlib.closing(_attempts(work, whole)) as attempts:  # workers end before the lock is let go
-            for index in episodes:
-                failure = problems[index] or next(attempts)
-                if failure is None:
-                    new += output.finish_episode(index, _make(work, index))
-                    continue
-                failures[index] = named_as_given(failure, output.staging.folder, source_folder(config))
-                reason = same_reason(source.repo_id, index, failures[index])
-                if reason not in reasons:
-                    reasons.add(reason)
-                    logger.error("skipped: %s", failures[index])
+        for index, failure in attempts(work, episodes, problems):
+            if failure is None:
+                continue
+            failures[index] = named_as_given(failure, output.staging.folder, source_folder(config))
+            reason = same_reason(source.repo_id, index, failures[index])
+            if reason not in reasons:
+                reasons.add(reason)
+                logger.error("skipped: %s", failures[index])
         bar.update(len(episodes) - bar.n)
-    return new, failures
+    return made_of(output, [index for index in episodes if index not in failures]), failures
+
+
+def made_of(output: OutputDataset, episodes: Iterable[int]) -> list[NewEpisode]:
+    """All new episodes of source episodes that are finished."""
+    return [new for index in episodes for new in output.finished_episode(index)]
+
+
+def attempts(work: Work, episodes: list[int], problems: Mapping[int, str]) -> Iterator[tuple[int, str | None]]:
+    """Finish episodes: each with why that is not possible, or nothing, as it is done, in their order.
+
+    `problems` are known reasons. Episodes are worked on by this process or, where that pays, by several.
+    """
+    whole = [index for index in episodes if index not in problems]
+    with contextlib.closing(_attempts(work, whole)) as results:  # workers end before the lock is let go
+        for index in episodes:
+            yield index, problems[index] if index in problems else next(results)
 
 
 def _attempts(work: Work, episodes: list[int]) -> Generator[str | None]:

@@ -61,6 +61,7 @@ class OutputDataset:
         staging: Staging | None = None,
         *,
         nvenc: bool = False,
+        replaces: bool = False,
     ) -> None:
         """Prepare the work folder.
 
@@ -70,11 +71,14 @@ class OutputDataset:
             root: its place.
             staging: a work folder that may hold what an earlier run finished; default: an empty one.
             nvenc: whether a GPU encodes the new videos where it can.
+            replaces: whether what lies in the place is an older state of this output, which the new one replaces.
 
         Raises:
             OutputError: the place is taken, lies inside the source, is being written by another run, or cannot be.
         """
-        check_place(source.root, root)
+        if not replaces:
+            check_place(source.root, root)
+        self.replaces = replaces
         self.source, self.repo_id, self.root, self.nvenc = source, repo_id, root, nvenc
         self._resumable = staging is not None
         self.staging = staging or Staging(root)
@@ -143,8 +147,19 @@ class OutputDataset:
             self.copies(index)
             return make()
 
-        new: list[NewEpisode] = kept.keep(FINISHED, complete)
-        kept.forget(SCENE)
+        with kept.locked():  # another process may work for the same output
+            new: list[NewEpisode] = kept.keep(FINISHED, complete)
+            kept.forget(SCENE)
+            kept.say_failed("")
+        return new
+
+    def finished_episode(self, index: int) -> list[NewEpisode]:
+        """The new episodes of one that is finished.
+
+        Raises:
+            OutputError: what was kept of them is damaged; it is removed, so that the same command makes them again.
+        """
+        new: list[NewEpisode] = self.episode(index).kept_value(FINISHED)
         return new
 
     def copies(self, index: int) -> StagedPictures:
@@ -164,6 +179,8 @@ class OutputDataset:
         recipe_yaml: str,
         skipped: Sequence[str] = (),
         report: Callable[[Path], object] = lambda folder: None,
+        *,
+        keep: bool = False,
     ) -> None:
         """Put the dataset together, read it again, and move it to its place.
 
@@ -172,6 +189,7 @@ class OutputDataset:
             recipe_yaml: the settings that it was made with.
             skipped: one line per source or new episode that is not in it.
             report: called with the folder of the complete dataset, before it is moved.
+            keep: whether the work folder stays, for a run that makes what is skipped here.
 
         Raises:
             EpisodeError: a file of the source cannot be copied.
@@ -190,9 +208,9 @@ class OutputDataset:
                 shutil.copytree(self.scenes, folder / store.FOLDER, copy_function=os.link)
             write_card(folder, self.repo_id, licence_of(self.source.root))
             report(folder)
-            if self.root.exists():
+            if self.root.exists() and not self.replaces:
                 raise OutputError(f"{self.root} appeared while the dataset was made; it was left as it is")
-            self.staging.publish(folder, self.root, skipped)
+            self.staging.publish(folder, self.root, skipped, keep=keep)
 
     def _with_times(self, episode: NewEpisode) -> Provenance:
         """The record of an episode, with what was done to its times."""
