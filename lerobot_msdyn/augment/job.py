@@ -105,15 +105,23 @@ def files_of(config: AugmentConfig, source: LeRobotDatasetMetadata, episodes: Se
 
 
 def checked_output(
-    config: AugmentConfig, opened: Opened, new_repo_id: str, new_root: Path, staging: Staging
+    config: AugmentConfig,
+    opened: Opened,
+    new_repo_id: str,
+    new_root: Path,
+    staging: Staging,
+    *,
+    replaces: bool = False,
 ) -> OutputDataset:
     """The output in the making, where there is the disk for it and its videos can be encoded.
+
+    `replaces`: an older state of it may lie in its place.
 
     Raises:
         OutputError: it cannot be made.
     """
     check_disk(opened.source, opened.episodes, config, staging.folder)
-    output = OutputDataset(opened.source, new_repo_id, new_root, staging, nvenc=config.nvenc)
+    output = OutputDataset(opened.source, new_repo_id, new_root, staging, nvenc=config.nvenc, replaces=replaces)
     output.check(opened.cameras, depth=config.render_depth)
     return output
 

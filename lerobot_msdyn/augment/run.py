@@ -13,6 +13,7 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from lerobot_msdyn.augment.assumed_depth import say_assumed_depth
+from lerobot_msdyn.augment.backgrounds import background_episodes
 from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.augment.cost import (
     first_speeds,
@@ -96,6 +97,19 @@ def run_local(
                 logger.error("skipped: %s", failures[index])
         bar.update(len(episodes) - bar.n)
     return made_of(output, [index for index in episodes if index not in failures]), failures
+
+
+def share_background(work: Work) -> None:
+    """Make what the episodes share of the background, by this process or, where that pays, by several."""
+    looked_at = background_episodes(work.source, work.config)
+    frames = sum(int(work.source.episodes[index]["length"]) for index in looked_at)
+    count = workers_for(work.config, frames, len(looked_at))
+    if count == 1:
+        _ = work.backgrounds
+        return
+    workers = Workers(count, work)
+    with workers:
+        _ = replace(work, run=workers.moving).backgrounds
 
 
 def made_of(output: OutputDataset, episodes: Iterable[int]) -> list[NewEpisode]:

@@ -4,6 +4,8 @@
       lock                        held while a run works here
       run.json                    what is made, from what: recipe, digests of the source's files, versions
       backgrounds.safetensors     what the episodes of a camera show together
+      shared.safetensors          what tasks of a cluster are told: episodes, cameras, and what their first node had
+      calibration/                where cameras stand, by the robot's joints
       episodes/000003/
         lock                        held while a process works on the episode
         failed.json                 why it was left out, where a cluster's task could not make it
@@ -45,6 +47,7 @@ LOCK, FAILED = "lock", "failed.json"  # of an episode
 RUN, PUBLISHED = "run.json", "published.json"
 REPLACED = "replaced"
 BACKGROUNDS = "backgrounds"
+SHARED = "shared"
 CONVERTED = "converted"
 WORTH_KEEPING = (SCENE, "variant", FINISHED)  # what takes long to make of an episode
 STOPPED = (KeyboardInterrupt, OutputError, WorkerError)  # ends of a run that the same command can go on from
