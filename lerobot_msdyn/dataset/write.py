@@ -198,8 +198,11 @@ class OutputDataset:
         folder = self.staging.folder / "dataset"
         with writing(folder), temporary_files_in(self.staging.folder):
             shutil.rmtree(folder, ignore_errors=True)
-            _Assembly(self.source, self.repo_id, folder, self.copies).build(episodes)
-            provenance = [self._with_times(episode) for episode in episodes]
+            off_s = _Assembly(self.source, self.repo_id, folder, self.copies).build(episodes)
+            provenance = [
+                replace(episode.provenance, times_replaced_s=off if off > KEPT_S else 0.0)
+                for episode, off in zip(episodes, off_s, strict=True)
+            ]
             write_provenance(folder, provenance, recipe_yaml, self.staging.run_digest())
             for number, episode in enumerate(episodes):
                 if episode.masks:
@@ -211,11 +214,6 @@ class OutputDataset:
             if self.root.exists() and not self.replaces:
                 raise OutputError(f"{self.root} appeared while the dataset was made; it was left as it is")
             self.staging.publish(folder, self.root, skipped, keep=keep)
-
-    def _with_times(self, episode: NewEpisode) -> Provenance:
-        """The record of an episode, with what was done to its times."""
-        off_s = off_grid_s(read_rows(self.source, episode.source_index), self.source.fps)
-        return replace(episode.provenance, times_replaced_s=off_s if off_s > KEPT_S else 0.0)
 
 
 def check_name(repo_id: str) -> None:
@@ -324,14 +322,16 @@ class _Assembly:
         write_info(self.meta.info, folder)
         write_tasks(self.meta.tasks, folder)
 
-    def build(self, episodes: list[NewEpisode]) -> None:
+    def build(self, episodes: list[NewEpisode]) -> list[float]:
+        """Write all of them; returns how far (s) the recorded times of each were off frame_index / fps."""
         places: list[dict[str, Any]] = [{} for _ in episodes]
         for key in self.source.video_keys:
             self._place_videos(key, episodes, places)
-        self._place_rows(episodes, places)
+        off_s = self._place_rows(episodes, places)
         self.meta.finalize()
         # LeRobot lists features in the order of a set, which is another in every process.
         write_stats(dict(sorted((self.meta.stats or {}).items())), self.folder)
+        return off_s
 
     def _place_videos(self, key: str, episodes: list[NewEpisode], places: list[dict[str, Any]]) -> None:
         """Concatenate one camera's videos into files of bounded size.
@@ -396,11 +396,15 @@ class _Assembly:
             count += length
         return True
 
-    def _place_rows(self, episodes: list[NewEpisode], places: list[dict[str, Any]]) -> None:
-        start = 0
+    def _place_rows(self, episodes: list[NewEpisode], places: list[dict[str, Any]]) -> list[float]:
+        start, off_s = 0, []
+        read: tuple[int, pa.Table] | None = None  # the episodes of one recording follow each other
         with _RowFiles(self.meta, self.folder) as files:
             for i, episode in enumerate(episodes):
-                rows = self._new_rows(episode, i, start)
+                if read is None or read[0] != episode.source_index:
+                    read = episode.source_index, read_rows(self.source, episode.source_index)
+                off_s.append(off_grid_s(read[1], self.source.fps))
+                rows = self._new_rows(episode, read[1], i, start)
                 chunk, file = files.add(rows)
                 stats = self.copies(episode.source_index).stats | self._row_stats(rows) | episode.pictures.stats
                 self.meta.save_episode(
@@ -411,10 +415,11 @@ class _Assembly:
                     {"data/chunk_index": chunk, "data/file_index": file} | places[i],
                 )
                 start += rows.num_rows
+        return off_s
 
-    def _new_rows(self, episode: NewEpisode, index: int, start: int) -> pa.Table:
+    def _new_rows(self, episode: NewEpisode, recorded: pa.Table, index: int, start: int) -> pa.Table:
         """The source's rows with new indices and, for re-rendered image features, new pictures."""
-        rows = on_grid(read_rows(self.source, episode.source_index), self.source.fps)
+        rows = on_grid(recorded, self.source.fps)
         new_columns: dict[str, Any] = {
             "episode_index": [index] * rows.num_rows,
             "index": range(start, start + rows.num_rows),
