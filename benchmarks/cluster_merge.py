@@ -9,6 +9,7 @@ episode is at most twice that of the smallest.
 """
 
 import argparse
+import functools
 import json
 import os
 import resource
@@ -112,14 +113,16 @@ def stage_all(output: OutputDataset) -> None:
             videos[name].parent.mkdir(parents=True, exist_ok=True)
             if not videos[name].exists():
                 os.link(staged, videos[name])
-        own, made = (
-            replace(copied, videos={KEY: videos["copied"]}),
-            replace(new.pictures, videos={KEY: videos["variant_00"]}),
-        )
-        kept.keep("copied", lambda own=own: own)
+        own = replace(copied, videos={KEY: videos["copied"]})
+        made = replace(new.pictures, videos={KEY: videos["variant_00"]})
         recorded = NewEpisode(index, Provenance("local/many", index, SOURCE_VARIANT, 0))
         rendered = NewEpisode(index, _provenance(index), made, seconds={"judging": 0.1, f"fitting {KEY}": 1.0})
-        kept.keep(FINISHED, lambda both=[recorded, rendered]: both)
+        kept.keep("copied", functools.partial(_same, own))
+        kept.keep(FINISHED, functools.partial(_same, [recorded, rendered]))
+
+
+def _same(value: Any) -> Any:
+    return value
 
 
 def _provenance(index: int) -> Provenance:

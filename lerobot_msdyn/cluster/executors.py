@@ -29,6 +29,7 @@ logger = logging.getLogger(__name__)
 COMPLETIONS = "completions"  # datatrove's folder of empty files, named by rank
 CONSOLE = "console"  # of what tasks of this machine print
 POLL_S = 0.2
+NOTHING_TO_DO = -1  # instead of a number of a job
 SLURM_FAULTS = (FileNotFoundError, subprocess.CalledProcessError)
 
 
@@ -132,7 +133,7 @@ def run_ray(job: Job, config: ClusterConfig) -> None:
 
     address = config.ray_address or os.environ.get("RAY_ADDRESS") or None
     if not ray.is_initialized():
-        ray.init(address=address, log_to_driver=False)
+        ray.init(address=address, log_to_driver=False, **({} if address else {"include_dashboard": False}))
     try:
         for step in (BACKGROUND, EPISODES, MERGE):
             executor = RayPipelineExecutor(
@@ -189,6 +190,7 @@ def slurm_executors(job: Job, config: ClusterConfig, slurm_logs: str | None = No
             qos=config.qos,
             env_command=config.env_command or f"export PATH={shlex.quote(str(Path(sys.executable).parent))}:$PATH",
             sbatch_args=options,
+            srun_args={"cpus-per-task": config.cpus_per_task},  # which srun does not take from sbatch any more
             depends=before,
             logging_dir=logs_of(job, step),
             slurm_logs_folder=None if slurm_logs is None else f"{slurm_logs}/{step}",
@@ -213,11 +215,15 @@ def run_slurm(job: Job, config: ClusterConfig) -> list[str]:
                 f"jobs {', '.join(queued)} of an earlier command for {job.new_root} are still queued or running; wait "
                 f"for them (squeue --me), or end them first: scancel {' '.join(queued)}"
             )
-        executors[MERGE].run()
+        for step in (BACKGROUND, EPISODES):
+            executors[step].launch_job()
+        if executors[EPISODES].job_id == NOTHING_TO_DO:
+            executors[MERGE].depends = executors[BACKGROUND]
+        executors[MERGE].launch_job()
     except SLURM_FAULTS as error:
         said = getattr(error, "stderr", None) or error
         raise OutputError(f"SLURM does not take the job: {one_line(said)}") from error
-    return [str(executor.job_id) for executor in executors.values() if executor.job_id not in (None, -1)]
+    return [str(executor.job_id) for executor in executors.values() if executor.job_id != NOTHING_TO_DO]
 
 
 def sbatch_file(job: Job, config: ClusterConfig) -> str:
@@ -225,7 +231,8 @@ def sbatch_file(job: Job, config: ClusterConfig) -> str:
     with _without_folders() as slurm_logs:
         executor = slurm_executors(job, config, slurm_logs)[EPISODES]
         arguments = executor.get_sbatch_args(min(job.tasks, executor.max_array_size))
-        run = f"srun -l -n 1 launch_pickled_pipeline {executor.logging_dir.resolve_paths('executor.pik')}"
+        launch = f"launch_pickled_pipeline {executor.logging_dir.resolve_paths('executor.pik')}"
+        run = f"srun --cpus-per-task={config.cpus_per_task} -l -n 1 {launch}"
         text: str = executor.get_launch_file_contents(arguments, run)
     return text.replace(f"{slurm_logs}/{EPISODES}", f"{logs_of(job, EPISODES)}/slurm_logs")
 

@@ -90,8 +90,10 @@ def _layout(path: Path, changed_ns: int, size: int) -> tuple[pq.FileMetaData, li
     spans: list[tuple[int, int] | None] = []
     for number in range(metadata.num_row_groups):
         about = metadata.row_group(number).column(column).statistics if column >= 0 else None
-        known = about is not None and about.has_min_max and isinstance(about.min, int)
-        spans.append((about.min, about.max) if known else None)
+        if about is None or not about.has_min_max or not isinstance(about.min, int):
+            spans.append(None)
+        else:
+            spans.append((about.min, about.max))
     return metadata, spans
 
 
