@@ -82,8 +82,8 @@ def augment(config: AugmentConfig, opened: "Opened", new_repo_id: str, new_root:
         staging.agree(describe_opened(config, opened.source, opened.episodes), restart=config.restart)
     output = checked_output(config, opened, new_repo_id, new_root, staging)
     with terse(config):
-        made, failures = run_local(opened.source, opened.episodes, opened.cameras, config, output)
-    done, left_out = deliver(config, opened, output, made, failures, lambda: time.perf_counter() - start)
+        failures = run_local(opened.source, opened.episodes, opened.cameras, config, output)
+    done, left_out = deliver(config, opened, output, failures, lambda: time.perf_counter() - start)
     sys.stdout.write(done + "".join(f"{line}\n" for line in left_out))
     return EXIT_SOME_EPISODES_FAILED if left_out else EXIT_OK
 

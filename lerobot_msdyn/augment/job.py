@@ -26,7 +26,7 @@ from lerobot_msdyn.dataset.read import open_source
 from lerobot_msdyn.dataset.select import lost_episodes, select_cameras, select_episodes
 from lerobot_msdyn.dataset.staging import Staging, digest_of_run, published_before
 from lerobot_msdyn.dataset.training_command import training_command
-from lerobot_msdyn.dataset.write import NewEpisode, OutputDataset, check_name
+from lerobot_msdyn.dataset.write import MadeEpisodes, OutputDataset, check_name
 from lerobot_msdyn.reconstruction.account import account_line
 from lerobot_msdyn.views.camera_change import units_of_shifts
 
@@ -130,7 +130,6 @@ def deliver(
     config: AugmentConfig,
     opened: Opened,
     output: OutputDataset,
-    made: Sequence[NewEpisode],
     failures: Mapping[int, str],
     seconds: Callable[[], float],
     *,
@@ -142,8 +141,7 @@ def deliver(
         config: the settings.
         opened: what was worked on.
         output: the dataset that is made.
-        made: all new episodes in order, the dropped ones among them.
-        failures: why source episodes are left out, by their numbers.
+        failures: why source episodes are left out, by their numbers; the others are finished.
         seconds: how long the job has taken so far.
         keep_failed: whether the work folder stays where episodes failed, for a run that tries them again.
 
@@ -151,8 +149,8 @@ def deliver(
         EpisodeError: there is no new episode.
         OutputError: the disk is full, or the place was taken meanwhile.
     """
-    source, cameras = opened.source, opened.cameras
-    new = [episode for episode in made if not episode.dropped]
+    source, cameras, new_root = opened.source, opened.cameras, output.root
+    made, new = MadeEpisodes.of(output, [index for index in opened.episodes if index not in failures])
     skipped = one_line_each(source.repo_id, failures) + _lost(config, source)
     dropped = [f"episode {e.source_index} variant {e.provenance.variant}: {e.dropped}" for e in made if e.dropped]
     left_out = [f"skipped: {line}" for line in skipped] + [f"dropped: {line}" for line in dropped]
@@ -161,22 +159,21 @@ def deliver(
     if not new:
         first = [*skipped, *dropped][0]
         raise EpisodeError(f"no episode could be augmented; nothing was written. First: {first}")
-    new_root = output.root
+    accounts = accounts_of(entries_of(made)[0])
+    units = units_of_shifts([episode.provenance.perturbation for episode in made])
+    rendered = sum(episode.provenance.variant != SOURCE_VARIANT for episode in new)
 
     def report(folder: Path) -> Path:
         publish(output.staging.folder / CALIBRATION, folder / FOLDER / CALIBRATION)
         return write_report(source, folder, new_root.name, made, skipped, len(failures), seconds())
 
     output.finish(new, recipe_text(config), left_out, report, keep=keep_failed and bool(failures))
-    accounts = accounts_of(entries_of(made)[0])
-    rendered = sum(episode.provenance.variant != SOURCE_VARIANT for episode in new)
     of_cameras = f" ({config.variants} per episode, {', '.join(cameras)})" if cameras else ""
     used = len(opened.episodes) - len(failures)
     text = (
         f"{used} of {len(opened.episodes)} episodes, {rendered} new ones{of_cameras}, {seconds():.0f} s\n"
         f"{''.join(f'{camera}: {account_line(account)}{chr(10)}' for camera, account in accounts.items())}"
-        f"{units_of_shifts([episode.provenance.perturbation for episode in made])}"
-        f"written to {new_root}\n"
+        f"{units}written to {new_root}\n"
         f"look at {new_root / 'report.html'}\n"
         f"train: {training_command(source, used, output.repo_id, new_root)}\n"
     )

@@ -70,8 +70,8 @@ def run_local(
     cameras: list[str],
     config: AugmentConfig,
     output: OutputDataset,
-) -> tuple[list[NewEpisode], dict[int, str]]:
-    """All episodes on this machine, and why some failed: they are left out, and every reason is logged once."""
+) -> dict[int, str]:
+    """Finish all episodes on this machine; returns why some failed: every reason is logged once."""
     config, problems = prepared(source, episodes, cameras, config, output)
     failures: dict[int, str] = {}
     reasons: set[str] = set()
@@ -96,7 +96,7 @@ def run_local(
                 reasons.add(reason)
                 logger.error("skipped: %s", failures[index])
         bar.update(len(episodes) - bar.n)
-    return made_of(output, [index for index in episodes if index not in failures]), failures
+    return failures
 
 
 def share_background(work: Work) -> None:
@@ -110,11 +110,6 @@ def share_background(work: Work) -> None:
     workers = Workers(count, work)
     with workers:
         _ = replace(work, run=workers.moving).backgrounds
-
-
-def made_of(output: OutputDataset, episodes: Iterable[int]) -> list[NewEpisode]:
-    """All new episodes of source episodes that are finished."""
-    return [new for index in episodes for new in output.finished_episode(index)]
 
 
 def attempts(work: Work, episodes: list[int], problems: Mapping[int, str]) -> Iterator[tuple[int, str | None]]:

@@ -39,7 +39,7 @@ def run(arguments: list[str]) -> int:
 
 def _end_with_parent() -> None:
     with contextlib.suppress(OSError):
-        sys.stdin.buffer.read()
+        os.read(sys.stdin.fileno(), 1)  # not by sys.stdin, whose lock a fork would inherit
     os.killpg(0, signal.SIGKILL)
 
 

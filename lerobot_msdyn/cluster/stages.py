@@ -22,7 +22,7 @@ from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.augment.failures import ranges
 from lerobot_msdyn.augment.job import Opened, checked_output, deliver, describe_opened, open_job
 from lerobot_msdyn.augment.robot_cameras import calibrated_before
-from lerobot_msdyn.augment.run import attempts, made_of, prepared, problems_of, share_background
+from lerobot_msdyn.augment.run import attempts, prepared, problems_of, share_background
 from lerobot_msdyn.augment.run_identity import describe_run
 from lerobot_msdyn.augment.workers import Work, terse
 from lerobot_msdyn.cluster.shards import shard
@@ -153,8 +153,7 @@ def merge(job: Job, errors: dict[int, str] | None = None) -> None:
         source = open_source(config.repo_id, config.root, config.tolerance_s)
         opened = Opened(source, wanted, shared["cameras"])
         output = OutputDataset(source, job.new_repo_id, place.new_root, staging, nvenc=config.nvenc, replaces=True)
-        made = made_of(output, [index for index in wanted if index in finished])
-        text, left_out = deliver(config, opened, output, made, failures, lambda: time.time() - begun, keep_failed=True)
+        text, left_out = deliver(config, opened, output, failures, lambda: time.time() - begun, keep_failed=True)
     if place.store is not None:
         place.store.remove(DATASET)
         place.store.put(place.new_root, DATASET)

@@ -50,6 +50,50 @@ class NewEpisode:
     seconds: Mapping[str, float] = field(default_factory=dict)  # what took how long, for the report
 
 
+class MadeEpisodes(Sequence):
+    """New episodes that are finished, read from the work folder as they are asked for: there may be thousands.
+
+    A `Sequence[NewEpisode]`, which is not said above: where annotations are checked, as in tests, one would be read
+    to see what it is, when the work folder may be gone.
+    """
+
+    def __init__(self, output: "OutputDataset", places: Sequence[tuple[int, int]]) -> None:
+        """Describe them.
+
+        Args:
+            output: the dataset that they are made for.
+            places: of each its source episode, and its number among the new ones of that.
+        """
+        self._output, self._places = output, places
+        self._read: tuple[int, list[NewEpisode]] = (-1, [])
+
+    @staticmethod
+    def of(output: "OutputDataset", episodes: Iterable[int]) -> tuple["MadeEpisodes", "MadeEpisodes"]:
+        """All new episodes of some source episodes; and those of them that are not dropped.
+
+        Raises:
+            OutputError: one is not finished after all.
+        """
+        made, kept = [], []
+        for index in episodes:
+            for number, new in enumerate(output.finished_episode(index)):
+                made.append((index, number))
+                if not new.dropped:
+                    kept.append((index, number))
+        return MadeEpisodes(output, made), MadeEpisodes(output, kept)
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __getitem__(self, place: Any) -> Any:
+        if isinstance(place, slice):
+            return MadeEpisodes(self._output, self._places[place])
+        index, number = self._places[place]
+        if self._read[0] != index:  # the new episodes of one recording follow each other
+            self._read = index, self._output.finished_episode(index)
+        return self._read[1][number]
+
+
 class OutputDataset:
     """A dataset in the making. Use as a context; what is finished is kept for the next run, until the dataset is."""
 
@@ -175,7 +219,7 @@ class OutputDataset:
 
     def finish(
         self,
-        episodes: list[NewEpisode],
+        episodes: list[NewEpisode] | MadeEpisodes,
         recipe_yaml: str,
         skipped: Sequence[str] = (),
         report: Callable[[Path], object] = lambda folder: None,
@@ -199,10 +243,10 @@ class OutputDataset:
         with writing(folder), temporary_files_in(self.staging.folder):
             shutil.rmtree(folder, ignore_errors=True)
             off_s = _Assembly(self.source, self.repo_id, folder, self.copies).build(episodes)
-            provenance = [
+            provenance = (
                 replace(episode.provenance, times_replaced_s=off if off > KEPT_S else 0.0)
                 for episode, off in zip(episodes, off_s, strict=True)
-            ]
+            )
             write_provenance(folder, provenance, recipe_yaml, self.staging.run_digest())
             for number, episode in enumerate(episodes):
                 if episode.masks:
@@ -322,7 +366,7 @@ class _Assembly:
         write_info(self.meta.info, folder)
         write_tasks(self.meta.tasks, folder)
 
-    def build(self, episodes: list[NewEpisode]) -> list[float]:
+    def build(self, episodes: Sequence[NewEpisode]) -> list[float]:
         """Write all of them; returns how far (s) the recorded times of each were off frame_index / fps."""
         places: list[dict[str, Any]] = [{} for _ in episodes]
         for key in self.source.video_keys:
@@ -333,7 +377,7 @@ class _Assembly:
         write_stats(dict(sorted((self.meta.stats or {}).items())), self.folder)
         return off_s
 
-    def _place_videos(self, key: str, episodes: list[NewEpisode], places: list[dict[str, Any]]) -> None:
+    def _place_videos(self, key: str, episodes: Sequence[NewEpisode], places: list[dict[str, Any]]) -> None:
         """Concatenate one camera's videos into files of bounded size.
 
         Copies and renders never share a file, nor do videos of which one cannot follow the other without being encoded
@@ -396,7 +440,7 @@ class _Assembly:
             count += length
         return True
 
-    def _place_rows(self, episodes: list[NewEpisode], places: list[dict[str, Any]]) -> list[float]:
+    def _place_rows(self, episodes: Sequence[NewEpisode], places: list[dict[str, Any]]) -> list[float]:
         start, off_s = 0, []
         read: tuple[int, pa.Table] | None = None  # the episodes of one recording follow each other
         with _RowFiles(self.meta, self.folder) as files:

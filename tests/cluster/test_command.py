@@ -1,6 +1,7 @@
 """The command: its settings, its plan, and what tasks of it leave when they are killed."""
 
 import contextlib
+import importlib.util
 import os
 import shutil
 import signal
@@ -75,7 +76,8 @@ def test_what_cannot_be(flags: list[str], message: str) -> None:
 
 
 def test_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    find = importlib.util.find_spec
+    monkeypatch.setattr("importlib.util.find_spec", lambda name, *rest: None if name == "datatrove" else find(name))
     with pytest.raises(ConfigError, match=r"pip install 'lerobot_msdyn\[cluster\]'"):
         run(["--repo=local/desk"])
 
