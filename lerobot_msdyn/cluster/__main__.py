@@ -4,6 +4,7 @@ python -m lerobot_msdyn.cluster --repo local/ds --executor slurm --tasks 64 --pa
 """
 
 import importlib.util
+import logging
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,6 +15,8 @@ from lerobot_msdyn.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from lerobot_msdyn.cluster.task import Job
+
+logger = logging.getLogger(__name__)
 
 COMMAND = "python -m lerobot_msdyn.cluster"
 ALIASES = {"repo": "repo_id"}
@@ -54,9 +57,11 @@ def _start(config: ClusterConfig, job: "Job") -> int:
 
     from lerobot_msdyn.cluster import executors
     from lerobot_msdyn.cluster.plan import at_once, unfinished_ranks
-    from lerobot_msdyn.cluster.stages import BACKGROUND, EPISODES, MERGE
+    from lerobot_msdyn.cluster.stages import BACKGROUND, EPISODES, MERGE, step_errors
     from lerobot_msdyn.cluster.task import RESULT, read_json
 
+    for message in step_errors(executors.logs_of(job, MERGE)).values():
+        logger.info("the last time: %s", message)
     job.write()
     files, _ = fsspec.url_to_fs(job.logs)
     if files.exists(f"{job.logs}/{RESULT}"):
