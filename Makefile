@@ -9,7 +9,7 @@ PYTHON ?= $(shell command -v python || command -v python3)
 UV := $(shell uv --version >/dev/null 2>&1 && command -v uv || echo .tools/bin/uv)
 VENV := .venv
 BIN := $(VENV)/bin
-EXTRAS := cuda,viz,priors,onnx,sfm,robots,evaluate,dev
+EXTRAS := cuda,viz,priors,onnx,sfm,robots,cluster,evaluate,dev
 TESTS ?= tests
 
 setup: $(VENV)/.ready

@@ -9,6 +9,7 @@ from lerobot_msdyn.core.errors import ConfigError
 
 COMMANDS = {  # name -> module, purpose
     "augment": ("augment.__main__", "write new episodes of a dataset, seen from displaced cameras"),
+    "cluster": ("cluster.__main__", "the same in many tasks: one machine, SLURM or Ray"),
     "viewer": ("viewer", "look at an episode, its scene and its new views in Rerun"),
     "priors": ("priors.__main__", "look at masks, depth and tracks of an episode"),
     "models": ("models", "list, fetch and check the models that help"),

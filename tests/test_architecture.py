@@ -15,7 +15,10 @@ ONLY_IN = {
     "flip_evaluator": {"evaluate"},
     "lpips": {"evaluate"},
     "onnxruntime": {"priors"},
-    "lerobot": {"dataset", "augment", "training", "evaluate", "synthetic/dataset", "split", "carry"},
+    "datatrove": {"cluster"},
+    "ray": {"cluster"},
+    "fsspec": {"cluster"},
+    "lerobot": {"dataset", "augment", "cluster", "training", "evaluate", "synthetic/dataset", "split", "carry"},
 }
 
 

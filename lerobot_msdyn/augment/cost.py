@@ -155,21 +155,39 @@ def predicted_seconds(
     speeds: Speeds, source: LeRobotDatasetMetadata, episodes: list[int], recipe: Recipe, workers: int = 1
 ) -> float:
     """Time of a whole run by so many workers; `speeds` are those of one, on its share of the cores."""
-    steps, background_s = float(recipe.fit.steps), 0.0
-    if recipe.scene.shared_background and source.total_episodes > 1:
-        indices = looked_at(source.total_episodes)
-        apart = len(set(indices) - set(episodes))  # the masks of the others serve for their own fit as well
-        masks_s = (len(indices) * speeds.read_s + apart * MASKS_SHARE * speeds.prepare_s) / workers
-        each_s = len(indices) * speeds.read_s + masks_s
-        background_s = each_s * source.total_frames / source.total_episodes + steps / 2 * speeds.step_s
-        steps *= FURTHER_STEPS
+    background_s = predicted_background_seconds(speeds, source, episodes, recipe, workers)
+    return background_s + predicted_episode_seconds(speeds, source, episodes, recipe, workers)
+
+
+def predicted_background_seconds(
+    speeds: Speeds, source: LeRobotDatasetMetadata, episodes: list[int], recipe: Recipe, workers: int = 1
+) -> float:
+    """The part of it before any episode, in which what all share is made."""
+    if not _shares_background(source, recipe):
+        return 0.0
+    indices = looked_at(source.total_episodes)
+    apart = len(set(indices) - set(episodes))  # the masks of the others serve for their own fit as well
+    masks_s = (len(indices) * speeds.read_s + apart * MASKS_SHARE * speeds.prepare_s) / workers
+    each_s = len(indices) * speeds.read_s + masks_s
+    return each_s * source.total_frames / source.total_episodes + recipe.fit.steps / 2 * speeds.step_s
+
+
+def predicted_episode_seconds(
+    speeds: Speeds, source: LeRobotDatasetMetadata, episodes: list[int], recipe: Recipe, workers: int = 1
+) -> float:
+    """The part of it for episodes, some of a run's."""
+    steps = recipe.fit.steps * (FURTHER_STEPS if _shares_background(source, recipe) else 1.0)
     busy_s = [0.0] * workers
     for index in episodes:
         frames = int(source.episodes[index]["length"])
         windows = -(-frames // recipe.fit.window_frames)
         one_s = frames * (speeds.read_s + speeds.prepare_s + recipe.variants * speeds.render_s)
         busy_s[busy_s.index(min(busy_s))] += one_s + windows * steps * speeds.step_s
-    return background_s + max(busy_s)
+    return max(busy_s)
+
+
+def _shares_background(source: LeRobotDatasetMetadata, recipe: Recipe) -> bool:
+    return recipe.scene.shared_background and source.total_episodes > 1
 
 
 def _saved_sizes(scene: DynamicScene) -> tuple[float, float]:

@@ -21,6 +21,7 @@ from lerobot_msdyn.core.config import Recipe, RobotConfig
 from lerobot_msdyn.core.errors import ConfigError, DatasetError, EpisodeError, PriorError
 from lerobot_msdyn.core.files import cache_folder, write_whole
 from lerobot_msdyn.core.sampling import REFERENCE_WIDTH, evenly
+from lerobot_msdyn.dataset.calibration import read_robot
 from lerobot_msdyn.dataset.checks import picture_size
 from lerobot_msdyn.dataset.read import read_colour
 from lerobot_msdyn.dataset.rows import read_rows, values_of
@@ -155,6 +156,24 @@ def calibrated[R: Recipe](
         if not found.believed:
             return config
         write_whole(path, json.dumps(found.content(source), indent=1).encode())
+    return replace(config, camera=replace(config.camera, calibration=path))
+
+
+def calibrated_before(config: AugmentConfig, folder: Path) -> AugmentConfig:
+    """The settings with the calibration file that `calibrated` has written to a folder, if it has written one.
+
+    Raises:
+        PriorError: the robot's description that it names is not on this machine.
+    """
+    path = folder / NAME
+    if not path.exists():
+        return config
+    robot = read_robot(path)
+    if robot is not None and not robot.urdf.is_file():
+        raise PriorError(
+            f"{robot.urdf} is not on this machine; the cameras were found by this description of the robot: put it "
+            "there, or name one that all machines see by --robot.urdf"
+        )
     return replace(config, camera=replace(config.camera, calibration=path))
 
 

@@ -4,7 +4,7 @@ import contextlib
 import functools
 import logging
 import sys
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from dataclasses import replace
 
 import torch
@@ -13,6 +13,7 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from lerobot_msdyn.augment.assumed_depth import say_assumed_depth
+from lerobot_msdyn.augment.backgrounds import background_episodes
 from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.augment.cost import (
     first_speeds,
@@ -37,21 +38,41 @@ logger = logging.getLogger(__name__)
 UNWATCHED_S = 30.0  # between updates of a progress bar that nobody watches
 
 
+def prepared(
+    source: LeRobotDatasetMetadata,
+    episodes: list[int],
+    cameras: list[str],
+    config: AugmentConfig,
+    output: OutputDataset,
+) -> tuple[AugmentConfig, dict[int, str]]:
+    """What is found out once, before any work: the settings with where cameras stand, and what no file is there for.
+
+    The second is why an episode cannot be read, by its number, as far as that is seen without opening its files.
+    """
+    chosen_device(config.device)  # complains, or says what is used, before anything is done
+    problems = problems_of(source, episodes)
+    whole = [index for index in episodes if index not in problems]
+    if whole:
+        config = calibrated(source, whole, cameras, config, output.staging.folder / CALIBRATION)
+    _say_what_is_assumed(source, cameras, config)
+    return config, problems
+
+
+def problems_of(source: LeRobotDatasetMetadata, episodes: Iterable[int]) -> dict[int, str]:
+    """Why episodes cannot be read, as far as that is seen without opening their files."""
+    problems = {index: files_problem(source, index) for index in episodes}
+    return {index: problem for index, problem in problems.items() if problem}
+
+
 def run_local(
     source: LeRobotDatasetMetadata,
     episodes: list[int],
     cameras: list[str],
     config: AugmentConfig,
     output: OutputDataset,
-) -> tuple[list[NewEpisode], dict[int, str]]:
-    """All episodes on this machine, and why some failed: they are left out, and every reason is logged once."""
-    chosen_device(config.device)  # complains, or says what is used, before anything is done
-    problems = {index: files_problem(source, index) for index in episodes}  # known before minutes of work
-    whole = [index for index in episodes if not problems[index]]
-    if whole:
-        config = calibrated(source, whole, cameras, config, output.staging.folder / CALIBRATION)
-    _say_what_is_assumed(source, cameras, config)
-    new: list[NewEpisode] = []
+) -> dict[int, str]:
+    """Finish all episodes on this machine; returns why some failed: every reason is logged once."""
+    config, problems = prepared(source, episodes, cameras, config, output)
     failures: dict[int, str] = {}
     reasons: set[str] = set()
     bar_format = "{desc} |{bar}| {percentage:3.0f} % of {total} episodes [{elapsed}<{remaining}]"
@@ -66,19 +87,40 @@ def run_local(
 
         bar.set_description_str("looking at the background", refresh=watched)
         work = Work(source, cameras, config, output, progress)
-        with contextlib.closing(_attempts(work, whole)) as attempts:  # workers end before the lock is let go
-            for index in episodes:
-                failure = problems[index] or next(attempts)
-                if failure is None:
-                    new += output.finish_episode(index, _make(work, index))
-                    continue
-                failures[index] = named_as_given(failure, output.staging.folder, source_folder(config))
-                reason = same_reason(source.repo_id, index, failures[index])
-                if reason not in reasons:
-                    reasons.add(reason)
-                    logger.error("skipped: %s", failures[index])
+        for index, failure in attempts(work, episodes, problems):
+            if failure is None:
+                continue
+            failures[index] = named_as_given(failure, output.staging.folder, source_folder(config))
+            reason = same_reason(source.repo_id, index, failures[index])
+            if reason not in reasons:
+                reasons.add(reason)
+                logger.error("skipped: %s", failures[index])
         bar.update(len(episodes) - bar.n)
-    return new, failures
+    return failures
+
+
+def share_background(work: Work) -> None:
+    """Make what the episodes share of the background, by this process or, where that pays, by several."""
+    looked_at = background_episodes(work.source, work.config)
+    frames = sum(int(work.source.episodes[index]["length"]) for index in looked_at)
+    count = workers_for(work.config, frames, len(looked_at))
+    if count == 1:
+        _ = work.backgrounds
+        return
+    workers = Workers(count, work)
+    with workers:
+        _ = replace(work, run=workers.moving).backgrounds
+
+
+def attempts(work: Work, episodes: list[int], problems: Mapping[int, str]) -> Iterator[tuple[int, str | None]]:
+    """Finish episodes: each with why that is not possible, or nothing, as it is done, in their order.
+
+    `problems` are known reasons. Episodes are worked on by this process or, where that pays, by several.
+    """
+    whole = [index for index in episodes if index not in problems]
+    with contextlib.closing(_attempts(work, whole)) as results:  # workers end before the lock is let go
+        for index in episodes:
+            yield index, problems[index] if index in problems else next(results)
 
 
 def _attempts(work: Work, episodes: list[int]) -> Generator[str | None]:

@@ -90,9 +90,13 @@ def _config_at(place: _Place) -> AugmentConfig:
 
 def workers_for(config: AugmentConfig, frames: int, episodes: int) -> int:
     """How many processes are worth while for so many frames of so many episodes."""
-    room = min(_memory() // MEMORY_EACH, _room_on_gpu(config))
-    wanted = config.workers or int(min(_cores(), room, frames // FRAMES_EACH))
+    wanted = config.workers or min(most_workers(config), frames // FRAMES_EACH)
     return max(1, min(wanted, episodes))
+
+
+def most_workers(config: AugmentConfig) -> int:
+    """How many processes this machine has cores and memory for, at least one."""
+    return max(1, int(min(cores(), _memory() // MEMORY_EACH, _room_on_gpu(config))))
 
 
 @contextlib.contextmanager
@@ -110,7 +114,8 @@ def _share_of_threads(count: int) -> int:
     return max(1, torch.get_num_threads() // count)
 
 
-def _cores() -> int:
+def cores() -> int:
+    """Of this machine, that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

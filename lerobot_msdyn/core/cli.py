@@ -181,6 +181,8 @@ def _split_flags(arguments: list[str], aliases: Mapping[str, str]) -> tuple[str 
             value = yaml.safe_load(text) if text else text
         except yaml.YAMLError as error:
             raise ConfigError(f"--{name}: {text!r} is not a YAML value: {one_line(error)}") from error
+        if isinstance(value, int) and ":" in text:  # YAML would have 04:00:00 be a number to base 60
+            value = text
         if name == "plugins":
             plugins += [str(item) for item in (value if isinstance(value, list) else [value])]
             continue

@@ -139,7 +139,7 @@ def _decoded(value: Any, arrays: dict[str, Tensor], base: Path) -> Any:
         case {"tensor": name}:
             return arrays[name]
         case {"array": name}:
-            return arrays[name].numpy()
+            return arrays[name].numpy().copy()  # a tensor that was read keeps its whole file mapped
         case {"path": relative}:
             return base / relative
         case {"list": items}:

@@ -37,14 +37,22 @@ def recordings(meta: LeRobotDatasetMetadata) -> list[int]:
         raise DatasetError(
             f"{meta.root}: its rows hold no numbers by which recordings can be told apart, and there is no meta/msdyn/"
         )
+    parents = list(range(len(marks)))  # of a forest: the root of each tree is its first episode
+
+    def root(index: int) -> int:
+        while parents[index] != index:
+            parents[index] = parents[parents[index]]
+            index = parents[index]
+        return index
+
     first: dict[Any, int] = {}
-    group = list(range(len(marks)))
     for index, mark in enumerate(marks):
-        joined = sorted({group[first[item]] for item in mark if item in first} | {index})
-        group = [joined[0] if item in joined else item for item in group]
+        joined = {root(first[item]) for item in mark if item in first} | {index}
+        for other in joined:
+            parents[other] = min(joined)
         for item in mark:
             first.setdefault(item, index)
-    return group
+    return [root(index) for index in range(len(marks))]
 
 
 def provenance_of(meta: LeRobotDatasetMetadata) -> list[dict[str, Any]] | None:

@@ -17,6 +17,7 @@ from lerobot_msdyn.dataset.checks import PICTURE_DTYPES, TEXT_DTYPES, place_prob
 TIMESTAMP_TOLERANCE_S = 1e-4  # LeRobot's
 KEPT_S = TIMESTAMP_TOLERANCE_S / 2  # from the grid, up to which a row's time is kept; LeRobot rounds once more
 FILES_KEPT = 256
+FILES_OPEN = 4  # whose list of row groups is kept, up to 20 MB each
 KINDS = {"b": "b", "i": "iu", "u": "iu", "f": "fiu"}  # kind of a feature's dtype -> kinds that its cells may have
 
 
@@ -35,7 +36,7 @@ def read_rows(meta: LeRobotDatasetMetadata, index: int) -> pa.Table:
     files = [source_file(meta, index, file) for file in data_files(meta, index)]
     path = files[0]
     try:
-        rows = pa.concat_tables([pq.read_table(file, filters=[("episode_index", "=", index)]) for file in files])
+        rows = pa.concat_tables([_read(file, index) for file in files])
     except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
         raise EpisodeError(f"{where}: {path} cannot be read ({first_line(error)})") from error
     if rows.num_rows != expected or expected == 0:
@@ -66,6 +67,34 @@ def data_files(meta: LeRobotDatasetMetadata, index: int) -> list[Path]:
     others = [path.relative_to(meta.root) for path in sorted((meta.root / "data").glob("*/*.parquet"))]
     found = {path: _rows_in(meta.root, path)[index] for path in others}
     return [path for path, count in found.items() if count] if sum(found.values()) == length else [named]
+
+
+def _read(path: Path, episode: int) -> pa.Table:
+    """The rows of one episode in a data file; of its row groups, only those that can hold them are read."""
+    about = path.stat()
+    metadata, spans = _layout(path, about.st_mtime_ns, about.st_size)
+    groups = [number for number, span in enumerate(spans) if span is None or span[0] <= episode <= span[1]]
+    with pq.ParquetFile(path, metadata=metadata) as file:
+        rows = file.read_row_groups(groups)
+    return rows.filter(pc.equal(rows["episode_index"], episode))
+
+
+@lru_cache(FILES_OPEN)
+def _layout(path: Path, changed_ns: int, size: int) -> tuple[pq.FileMetaData, list[tuple[int, int] | None]]:
+    """What a data file says of itself, and the first and last episode of each of its row groups, if known.
+
+    It is read once: a file that LeRobot records has a row group per episode, thousands of them.
+    """
+    metadata = pq.read_metadata(path)
+    column = metadata.schema.to_arrow_schema().get_field_index("episode_index")
+    spans: list[tuple[int, int] | None] = []
+    for number in range(metadata.num_row_groups):
+        about = metadata.row_group(number).column(column).statistics if column >= 0 else None
+        if about is None or not about.has_min_max or not isinstance(about.min, int):
+            spans.append(None)
+        else:
+            spans.append((about.min, about.max))
+    return metadata, spans
 
 
 def _rows_in(root: Path, name: Path) -> Counter[int]:

@@ -4,26 +4,32 @@
       lock                        held while a run works here
       run.json                    what is made, from what: recipe, digests of the source's files, versions
       backgrounds.safetensors     what the episodes of a camera show together
+      shared.safetensors          what tasks of a cluster are told: episodes, cameras, and what their first node had
+      calibration/                where cameras stand, by the robot's joints
       episodes/000003/
+        lock                        held while a process works on the episode
+        failed.json                 why it was left out, where a cluster's task could not make it
         copied.safetensors        the source's own pictures: files (in copied/) and statistics
         scene_<camera>.safetensors    a fitted scene
         variant_00.safetensors    one new episode: files (in variant_00/), statistics, provenance
         finished.safetensors      all new episodes of this one; the scenes are removed
       converted/                  the source, where it had to be converted
       dataset/                    the dataset as it is put together, always anew
+      replaced/                   an older state of the output, while a newer one takes its place
       published.json              written right before the dataset is moved to its place
 
 Every file is complete or absent. A value is read back from its file also in the run that made it, so that a run that
 was stopped computes with the same bits as one that was not.
 """
 
+import contextlib
 import hashlib
 import json
 import logging
 import os
 import shutil
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +43,11 @@ logger = logging.getLogger(__name__)
 
 FINISHED = "finished"
 SCENE = "scene"
+LOCK, FAILED = "lock", "failed.json"  # of an episode
 RUN, PUBLISHED = "run.json", "published.json"
+REPLACED = "replaced"
 BACKGROUNDS = "backgrounds"
+SHARED = "shared"
 CONVERTED = "converted"
 WORTH_KEEPING = (SCENE, "variant", FINISHED)  # what takes long to make of an episode
 STOPPED = (KeyboardInterrupt, OutputError, WorkerError)  # ends of a run that the same command can go on from
@@ -76,6 +85,53 @@ class Kept:
         with writing(path):
             save_value(path, value, self.folder)
         return load_value(path, self.folder)
+
+    def kept_value(self, name: str) -> Any:
+        """The value of this name, which is there.
+
+        Raises:
+            OutputError: it is absent or damaged; it is removed, so that it is made again.
+        """
+        path = self._path(name)
+        try:
+            return load_value(path, self.folder)
+        except ValueFileError as error:
+            path.unlink(missing_ok=True)
+            raise OutputError(f"{error}; give the same command again, which makes it anew") from error
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Within, no other process that asks for it works on what is kept here; waits until that is so.
+
+        Raises:
+            OutputError: the folder cannot be written.
+        """
+        lock = FileLock(self.folder / LOCK)
+        with writing(self.folder):
+            self.folder.mkdir(parents=True, exist_ok=True)
+            try:
+                lock.acquire(timeout=0)
+            except Timeout:
+                logger.info("%s: another process works on it; waiting for it", self.folder)
+                lock.acquire()
+        try:
+            yield
+        finally:
+            lock.release()
+
+    def say_failed(self, reason: str) -> None:
+        """Note why nothing could be made here; empty: it could."""
+        if reason:
+            write_whole(self.folder / FAILED, json.dumps(reason).encode())
+        else:
+            (self.folder / FAILED).unlink(missing_ok=True)
+
+    def failed(self) -> str:
+        """What `say_failed` noted; empty where it noted nothing."""
+        try:
+            return str(json.loads((self.folder / FAILED).read_text()))
+        except (OSError, ValueError):
+            return ""
 
     def has(self, name: str) -> bool:
         """Whether the value is there."""
@@ -187,8 +243,18 @@ class Staging(Kept):
         with writing(path):
             write_whole(path, json.dumps(run, indent=1, sort_keys=True).encode())
 
-    def publish(self, folder: Path, root: Path, skipped: Sequence[str]) -> None:
-        """Move a finished dataset to its place and remove this folder."""
+    def publish(self, folder: Path, root: Path, skipped: Sequence[str], *, keep: bool = False) -> None:
+        """Move a finished dataset to its place, in which an older state of it may lie, and remove this folder.
+
+        With `keep` this folder stays, for a run that makes what was skipped.
+        """
+        if root.exists():
+            shutil.rmtree(self.folder / REPLACED, ignore_errors=True)
+            root.rename(self.folder / REPLACED)
+        if keep:
+            folder.rename(root)
+            shutil.rmtree(self.folder / REPLACED, ignore_errors=True)
+            return
         write_whole(self.folder / PUBLISHED, json.dumps(list(skipped)).encode())
         folder.rename(root)
         self.remove()

@@ -50,6 +50,50 @@ class NewEpisode:
     seconds: Mapping[str, float] = field(default_factory=dict)  # what took how long, for the report
 
 
+class MadeEpisodes(Sequence):
+    """New episodes that are finished, read from the work folder as they are asked for: there may be thousands.
+
+    A `Sequence[NewEpisode]`, which is not said above: where annotations are checked, as in tests, one would be read
+    to see what it is, when the work folder may be gone.
+    """
+
+    def __init__(self, output: "OutputDataset", places: Sequence[tuple[int, int]]) -> None:
+        """Describe them.
+
+        Args:
+            output: the dataset that they are made for.
+            places: of each its source episode, and its number among the new ones of that.
+        """
+        self._output, self._places = output, places
+        self._read: tuple[int, list[NewEpisode]] = (-1, [])
+
+    @staticmethod
+    def of(output: "OutputDataset", episodes: Iterable[int]) -> tuple["MadeEpisodes", "MadeEpisodes"]:
+        """All new episodes of some source episodes; and those of them that are not dropped.
+
+        Raises:
+            OutputError: one is not finished after all.
+        """
+        made, kept = [], []
+        for index in episodes:
+            for number, new in enumerate(output.finished_episode(index)):
+                made.append((index, number))
+                if not new.dropped:
+                    kept.append((index, number))
+        return MadeEpisodes(output, made), MadeEpisodes(output, kept)
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __getitem__(self, place: Any) -> Any:
+        if isinstance(place, slice):
+            return MadeEpisodes(self._output, self._places[place])
+        index, number = self._places[place]
+        if self._read[0] != index:  # the new episodes of one recording follow each other
+            self._read = index, self._output.finished_episode(index)
+        return self._read[1][number]
+
+
 class OutputDataset:
     """A dataset in the making. Use as a context; what is finished is kept for the next run, until the dataset is."""
 
@@ -61,6 +105,7 @@ class OutputDataset:
         staging: Staging | None = None,
         *,
         nvenc: bool = False,
+        replaces: bool = False,
     ) -> None:
         """Prepare the work folder.
 
@@ -70,11 +115,14 @@ class OutputDataset:
             root: its place.
             staging: a work folder that may hold what an earlier run finished; default: an empty one.
             nvenc: whether a GPU encodes the new videos where it can.
+            replaces: whether what lies in the place is an older state of this output, which the new one replaces.
 
         Raises:
             OutputError: the place is taken, lies inside the source, is being written by another run, or cannot be.
         """
-        check_place(source.root, root)
+        if not replaces:
+            check_place(source.root, root)
+        self.replaces = replaces
         self.source, self.repo_id, self.root, self.nvenc = source, repo_id, root, nvenc
         self._resumable = staging is not None
         self.staging = staging or Staging(root)
@@ -143,8 +191,19 @@ class OutputDataset:
             self.copies(index)
             return make()
 
-        new: list[NewEpisode] = kept.keep(FINISHED, complete)
-        kept.forget(SCENE)
+        with kept.locked():  # another process may work for the same output
+            new: list[NewEpisode] = kept.keep(FINISHED, complete)
+            kept.forget(SCENE)
+            kept.say_failed("")
+        return new
+
+    def finished_episode(self, index: int) -> list[NewEpisode]:
+        """The new episodes of one that is finished.
+
+        Raises:
+            OutputError: what was kept of them is damaged; it is removed, so that the same command makes them again.
+        """
+        new: list[NewEpisode] = self.episode(index).kept_value(FINISHED)
         return new
 
     def copies(self, index: int) -> StagedPictures:
@@ -160,10 +219,12 @@ class OutputDataset:
 
     def finish(
         self,
-        episodes: list[NewEpisode],
+        episodes: list[NewEpisode] | MadeEpisodes,
         recipe_yaml: str,
         skipped: Sequence[str] = (),
         report: Callable[[Path], object] = lambda folder: None,
+        *,
+        keep: bool = False,
     ) -> None:
         """Put the dataset together, read it again, and move it to its place.
 
@@ -172,6 +233,7 @@ class OutputDataset:
             recipe_yaml: the settings that it was made with.
             skipped: one line per source or new episode that is not in it.
             report: called with the folder of the complete dataset, before it is moved.
+            keep: whether the work folder stays, for a run that makes what is skipped here.
 
         Raises:
             EpisodeError: a file of the source cannot be copied.
@@ -180,8 +242,11 @@ class OutputDataset:
         folder = self.staging.folder / "dataset"
         with writing(folder), temporary_files_in(self.staging.folder):
             shutil.rmtree(folder, ignore_errors=True)
-            _Assembly(self.source, self.repo_id, folder, self.copies).build(episodes)
-            provenance = [self._with_times(episode) for episode in episodes]
+            off_s = _Assembly(self.source, self.repo_id, folder, self.copies).build(episodes)
+            provenance = (
+                replace(episode.provenance, times_replaced_s=off if off > KEPT_S else 0.0)
+                for episode, off in zip(episodes, off_s, strict=True)
+            )
             write_provenance(folder, provenance, recipe_yaml, self.staging.run_digest())
             for number, episode in enumerate(episodes):
                 if episode.masks:
@@ -190,14 +255,9 @@ class OutputDataset:
                 shutil.copytree(self.scenes, folder / store.FOLDER, copy_function=os.link)
             write_card(folder, self.repo_id, licence_of(self.source.root))
             report(folder)
-            if self.root.exists():
+            if self.root.exists() and not self.replaces:
                 raise OutputError(f"{self.root} appeared while the dataset was made; it was left as it is")
-            self.staging.publish(folder, self.root, skipped)
-
-    def _with_times(self, episode: NewEpisode) -> Provenance:
-        """The record of an episode, with what was done to its times."""
-        off_s = off_grid_s(read_rows(self.source, episode.source_index), self.source.fps)
-        return replace(episode.provenance, times_replaced_s=off_s if off_s > KEPT_S else 0.0)
+            self.staging.publish(folder, self.root, skipped, keep=keep)
 
 
 def check_name(repo_id: str) -> None:
@@ -306,16 +366,18 @@ class _Assembly:
         write_info(self.meta.info, folder)
         write_tasks(self.meta.tasks, folder)
 
-    def build(self, episodes: list[NewEpisode]) -> None:
+    def build(self, episodes: Sequence[NewEpisode]) -> list[float]:
+        """Write all of them; returns how far (s) the recorded times of each were off frame_index / fps."""
         places: list[dict[str, Any]] = [{} for _ in episodes]
         for key in self.source.video_keys:
             self._place_videos(key, episodes, places)
-        self._place_rows(episodes, places)
+        off_s = self._place_rows(episodes, places)
         self.meta.finalize()
         # LeRobot lists features in the order of a set, which is another in every process.
         write_stats(dict(sorted((self.meta.stats or {}).items())), self.folder)
+        return off_s
 
-    def _place_videos(self, key: str, episodes: list[NewEpisode], places: list[dict[str, Any]]) -> None:
+    def _place_videos(self, key: str, episodes: Sequence[NewEpisode], places: list[dict[str, Any]]) -> None:
         """Concatenate one camera's videos into files of bounded size.
 
         Copies and renders never share a file, nor do videos of which one cannot follow the other without being encoded
@@ -378,11 +440,15 @@ class _Assembly:
             count += length
         return True
 
-    def _place_rows(self, episodes: list[NewEpisode], places: list[dict[str, Any]]) -> None:
-        start = 0
+    def _place_rows(self, episodes: Sequence[NewEpisode], places: list[dict[str, Any]]) -> list[float]:
+        start, off_s = 0, []
+        read: tuple[int, pa.Table] | None = None  # the episodes of one recording follow each other
         with _RowFiles(self.meta, self.folder) as files:
             for i, episode in enumerate(episodes):
-                rows = self._new_rows(episode, i, start)
+                if read is None or read[0] != episode.source_index:
+                    read = episode.source_index, read_rows(self.source, episode.source_index)
+                off_s.append(off_grid_s(read[1], self.source.fps))
+                rows = self._new_rows(episode, read[1], i, start)
                 chunk, file = files.add(rows)
                 stats = self.copies(episode.source_index).stats | self._row_stats(rows) | episode.pictures.stats
                 self.meta.save_episode(
@@ -393,10 +459,11 @@ class _Assembly:
                     {"data/chunk_index": chunk, "data/file_index": file} | places[i],
                 )
                 start += rows.num_rows
+        return off_s
 
-    def _new_rows(self, episode: NewEpisode, index: int, start: int) -> pa.Table:
+    def _new_rows(self, episode: NewEpisode, recorded: pa.Table, index: int, start: int) -> pa.Table:
         """The source's rows with new indices and, for re-rendered image features, new pictures."""
-        rows = on_grid(read_rows(self.source, episode.source_index), self.source.fps)
+        rows = on_grid(recorded, self.source.fps)
         new_columns: dict[str, Any] = {
             "episode_index": [index] * rows.num_rows,
             "index": range(start, start + rows.num_rows),

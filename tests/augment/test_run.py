@@ -13,7 +13,7 @@ from lerobot_msdyn.augment.config import AugmentConfig
 @pytest.mark.parametrize(("device", "expected"), [("cuda", 2), ("cpu", 5)])
 def test_workers_share_the_memory_of_a_gpu(monkeypatch: pytest.MonkeyPatch, device: str, expected: int) -> None:
     monkeypatch.setattr(workers, "chosen_device", lambda name: torch.device(device))
-    monkeypatch.setattr(workers, "_cores", lambda: 8)
+    monkeypatch.setattr(workers, "cores", lambda: 8)
     monkeypatch.setattr(workers, "_memory", lambda: 64e9)
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (11_000_000_000, 24_000_000_000))
     assert workers.workers_for(AugmentConfig(), 10_000, 5) == expected

@@ -124,20 +124,27 @@ def _figures(
     episodes: Sequence[NewEpisode], entries: Sequence[ViewEntry], skipped_episodes: int, seconds: float
 ) -> dict[str, str]:
     """What the page says at its top."""
-    made = [episode for episode in episodes if episode.provenance.variant != SOURCE_VARIANT]
     scores = [entry.score for entry in entries if not entry.dropped and np.isfinite(entry.score)]
     fitting: dict[tuple[int, str], float] = {}
-    for episode in made:
+    new = dropped = rejected = 0
+    judging_s = 0.0
+    for episode in episodes:
+        if episode.provenance.variant == SOURCE_VARIANT:
+            continue
+        new += not episode.dropped
+        dropped += bool(episode.dropped)
+        rejected += len(episode.provenance.gate["rejected"])
+        judging_s += episode.seconds["judging"]
         fitting |= {(episode.source_index, key): s for key, s in episode.seconds.items() if key.startswith("fitting ")}
     return {
-        "new episodes": str(sum(not episode.dropped for episode in made)),
-        "dropped by the gate": str(sum(bool(episode.dropped) for episode in made)),
+        "new episodes": str(new),
+        "dropped by the gate": str(dropped),
         "source episodes skipped": str(skipped_episodes),
-        "samples rejected": str(sum(len(episode.provenance.gate["rejected"]) for episode in made)),
+        "samples rejected": str(rejected),
         "expected quality, median": f"{np.median(scores):.1f} dB" if scores else "not judged",
         "all in all": _time(seconds),
         "in fitting": _time(sum(fitting.values())),
-        "in judging": _time(sum(episode.seconds["judging"] for episode in made)),
+        "in judging": _time(judging_s),
     }
 
 
