@@ -159,7 +159,7 @@ def calibrated[R: Recipe](
     return replace(config, camera=replace(config.camera, calibration=path))
 
 
-def calibrated_before(config: AugmentConfig, folder: Path) -> AugmentConfig:
+def calibrated_before[R: Recipe](config: R, folder: Path) -> R:
     """The settings with the calibration file that `calibrated` has written to a folder, if it has written one.
 
     Raises:

@@ -20,6 +20,7 @@ from lerobot_msdyn.render.cpu.threads import run
 from lerobot_msdyn.scene.gaussians import SH_C0, SH_C1, shaded
 
 _BLOCK = 4096  # points
+TINY = 1e-24  # squared length of an orientation, below which it is none
 
 
 def shaded_moving(
@@ -78,7 +79,7 @@ def _tickets(points: Tensor) -> int:
 @inlined
 def _turned(w: float, x: float, y: float, z: float, v0: float, v1: float, v2: float) -> tuple[float, float, float]:
     """A vector rotated by a quaternion of any length."""
-    s = 2 / max(w * w + x * x + y * y + z * z, np.float32(1e-24))
+    s = 2.0 / max(w * w + x * x + y * y + z * z, TINY)
     c0, c1, c2 = y * v2 - z * v1, z * v0 - x * v2, x * v1 - y * v0
     return (
         v0 + s * (w * c0 + y * c2 - z * c1),
@@ -167,7 +168,7 @@ def _backward(
                 g1 -= linear * sh[point, 1, channel]
                 g2 += linear * sh[point, 2, channel]
             w0, w1, w2 = y * g2 - z * g1, z * g0 - x * g2, x * g1 - y * g0
-            unit = 2 / max(cw * cw + cx * cx + cy * cy + cz * cz, np.float32(1e-24))
+            unit = 2.0 / max(cw * cw + cx * cx + cy * cy + cz * cz, TINY)
             to_canonical[time, point, 0] = -unit * (w0 * cx + w1 * cy + w2 * cz)
             to_canonical[time, point, 1] = unit * (w0 * cw + w1 * cz - w2 * cy)
             to_canonical[time, point, 2] = unit * (w1 * cw + w2 * cx - w0 * cz)
@@ -175,7 +176,7 @@ def _backward(
             g0, g1, g2 = _turned(cw, -cx, -cy, -cz, g0, g1, g2)
             g0, g1, g2 = _turned(qw, qx, qy, qz, g0, g1, g2)  # of the direction in the world
             w0, w1, w2 = g1 * s2 - g2 * s1, g2 * s0 - g0 * s2, g0 * s1 - g1 * s0
-            unit = 2 / max(qw * qw + qx * qx + qy * qy + qz * qz, np.float32(1e-24))
+            unit = 2.0 / max(qw * qw + qx * qx + qy * qy + qz * qz, TINY)
             to_quats[time, point, 0] = -unit * (w0 * qx + w1 * qy + w2 * qz)
             to_quats[time, point, 1] = unit * (w0 * qw + w1 * qz - w2 * qy)
             to_quats[time, point, 2] = unit * (w1 * qw + w2 * qx - w0 * qz)

@@ -12,7 +12,8 @@ def colours_and_gradients(kind: torch.dtype, count: int = 5000, times: int = 2) 
     shapes = ((count, 4, 3), (count, 4), (times, count, 4), (times, count, 3))
     given = [torch.randn(shape, generator=generator).to(kind).requires_grad_() for shape in shapes]
     eye, towards = (torch.randn(shape, generator=generator).to(kind) for shape in ((times, 3), (times, count, 3)))
-    colours = shaded_moving(*given, 4 * eye)
+    sh, canonical, quats, means = given
+    colours = shaded_moving(sh, canonical, quats, means, 4 * eye)
     (colours * towards).sum().backward()
     return [colours, *(each.grad for each in given if each.grad is not None)]
 
