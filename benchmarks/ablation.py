@@ -173,7 +173,7 @@ def reconstructed(prepared: Prepared, row: Row, recipe: Recipe) -> Reconstructio
         draft.priors = prepared.priors
 
     def given_background(draft: Draft) -> None:
-        draft.stand_before(prepared.empty)
+        draft.stand_before(fixed_view(prepared.empty, draft.view.camera))
 
     def fitted(draft: Draft) -> None:
         scene = draft.scene
@@ -185,7 +185,7 @@ def reconstructed(prepared: Prepared, row: Row, recipe: Recipe) -> Reconstructio
             draft.view,
             draft.priors,
             recipe.fit,
-            empty=draft.empty.rgb,
+            empty=draft.keys[0].empty.rgb,
             distance=draft.distance,
             seed=recipe.seed,
             learned=learned,

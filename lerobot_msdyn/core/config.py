@@ -50,6 +50,8 @@ class CameraConfig:
     by_robot: bool = True
     # auto (the calibration, else fixed), fixed, sfm (pycolmap, for a moving camera), or an .npz file with K and w2c.
     poses: str = one_of(AUTO, (AUTO,), registry=CAMERAS)
+    # Whether the poses of a camera that moves are refined: each frame is laid over what stands still.
+    refine_poses: bool = True
     # Horizontal field of view in degrees, used where no calibration names the camera.
     horizontal_fov_deg: float = between(60.0, 5, 170)
     # Look for the field of view at which rigid things keep their size; needs depth other than the plane's.
