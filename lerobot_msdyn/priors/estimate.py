@@ -11,6 +11,8 @@ from lerobot_msdyn.core.config import CameraConfig, Device, PriorsConfig
 from lerobot_msdyn.core.observations import Origin, Priors, View
 from lerobot_msdyn.priors.cache import open_cache
 from lerobot_msdyn.priors.camera.field_of_view import with_searched_fov
+from lerobot_msdyn.priors.camera.scale import scaled_to_depth
+from lerobot_msdyn.priors.camera.sfm import SFM
 from lerobot_msdyn.priors.from_file import CameraFile, DepthFile, MaskFile, TrackFile
 from lerobot_msdyn.priors.provide import provide
 from lerobot_msdyn.priors.registry import CameraProvider, DepthProvider, MaskProvider, Masks, TrackProvider
@@ -61,6 +63,9 @@ def estimate_priors(
     depth, depth_from = provide(
         DepthProvider, config.depth, posed, lambda provider: provider.estimate(posed, instances), file=DepthFile
     )
+    if camera_from.provider == SFM:
+        pinhole, factor = scaled_to_depth(pinhole, view.rgb, depth, instances)
+        camera_from = replace(camera_from, why=f"{camera_from.why}; shifts times {factor:.4g}, by the depth")
     tracks, tracks_from = provide(
         TrackProvider, config.tracks, posed, lambda provider: provider.estimate(posed, instances), file=TrackFile
     )
