@@ -9,7 +9,10 @@ from lerobot_msdyn.priors.registry import MASKS, Estimate, MaskProvider, Masks
 from lerobot_msdyn.priors.request import Request
 
 
-@MASKS.register("change")
+CHANGE = "change"  # the name of the provider
+
+
+@MASKS.register(CHANGE)
 class Change(MaskProvider):
     """Can always be used."""
 
