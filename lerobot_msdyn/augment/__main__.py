@@ -76,14 +76,16 @@ def run(arguments: list[str]) -> int:
 
 def _open(config: AugmentConfig, root: Path | None) -> tuple["LeRobotDatasetMetadata", list[int], list[str]]:
     """The source, its episodes and its cameras."""
-    from lerobot_msdyn.augment.moving_cameras import still_cameras
+    from lerobot_msdyn.augment.moving_cameras import cameras_off_the_gripper, still_cameras
     from lerobot_msdyn.dataset.read import open_source
     from lerobot_msdyn.dataset.select import select_cameras, select_episodes
 
     source = open_source(config.repo_id, root, config.tolerance_s)
     episodes = select_episodes(source, config.episodes)
     cameras = select_cameras(source, config.cameras, allow_moving=config.allow_moving)
-    if not config.allow_moving:
+    if config.allow_moving:
+        cameras = cameras_off_the_gripper(source, cameras, config)
+    else:
         cameras = still_cameras(source, episodes, cameras, config)
     return source, episodes, cameras
 

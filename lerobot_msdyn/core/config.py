@@ -373,7 +373,7 @@ class Recipe:
     crop_to_covered: bool = False
     # Keep masks of what was not seen, per frame, in meta/msdyn/unseen/.
     masks: bool = False
-    # Whether cameras that move with the robot may be re-rendered; their pictures are tied to its state.
+    # Whether cameras that move, in a hand or on a head, may be re-rendered; those on the gripper are copied always.
     allow_moving: bool = False
     gate: GateConfig = field(default_factory=GateConfig)
 

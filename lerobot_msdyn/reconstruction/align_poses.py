@@ -137,9 +137,9 @@ def _linear(
     None where too little of the surface is seen.
     """
     gain, offset = 1 + total[6], total[7]
-    points = transform_points(invert_se3(pose), surface.points)
-    xy, _ = project(points, frame.intrinsics)
-    there, points = xy.numpy() - np.float32(0.5), points.numpy().astype(np.float64)
+    in_camera = transform_points(invert_se3(pose), surface.points)
+    xy, _ = project(in_camera, frame.intrinsics)
+    there, points = xy.numpy() - np.float32(0.5), in_camera.numpy().astype(np.float64)
     height, width = frame.depth.shape
     inside = (points[:, 2] > 0) & (there >= 0).all(1) & (there[:, 0] <= width - 1) & (there[:, 1] <= height - 1)
     rows = np.flatnonzero(inside)

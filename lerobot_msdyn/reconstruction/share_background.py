@@ -85,7 +85,9 @@ def _fitted(background: SharedBackground, recipe: Recipe) -> SharedBackground:
     nothing = torch.zeros(1, *empty.seen.shape, dtype=torch.uint8)
     priors = Priors(empty.depth[None], nothing, _no_tracks(), DepthTraits(metric=True))
     view = View(empty.rgb[None], camera)
-    scene = initialise(view, priors, replace(recipe.scene, moving_gaussians=0), recipe.motion, fixed_view(empty, camera))
+    scene = initialise(
+        view, priors, replace(recipe.scene, moving_gaussians=0), recipe.motion, fixed_view(empty, camera)
+    )
     pixel_by_pixel = replace(recipe.fit.density, enabled=False)  # as `adapted` expects it
     config = replace(recipe.fit, steps=recipe.fit.steps // 2, shadows=False, held_out_frames=0, density=pixel_by_pixel)
     try:

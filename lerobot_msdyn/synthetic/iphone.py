@@ -87,9 +87,7 @@ class Sight:
         return Sight(self.number, camera, self.frames)
 
 
-def _write_pictures(
-    scene: SyntheticScene, sights: list[Sight], root: Path, factor: int, network_depth: bool
-) -> None:
+def _write_pictures(scene: SyntheticScene, sights: list[Sight], root: Path, factor: int, network_depth: bool) -> None:
     """Pictures, LiDAR-like depth and masks of one size; with those of full size, Shape of Motion's priors as well."""
     size = f"{factor}x"
     scene = replace(scene, cameras={**scene.cameras, "front": sights[0].camera})  # what is seen, is seen by this one

@@ -52,9 +52,7 @@ def test_a_shadow_stays_where_it_falls(scene: tuple[DynamicScene, View, Priors])
     drawn, view, priors = scene
     rgb = view.rgb.clone()
     rgb[:, :, :6] = 80
-    gain = static_shading(drawn, dataclasses.replace(view, rgb=rgb), priors, WALL).static_gain(
-        torch.tensor([2])
-    )
+    gain = static_shading(drawn, dataclasses.replace(view, rgb=rgb), priors, WALL).static_gain(torch.tensor([2]))
     image = gain.reshape(HEIGHT, WIDTH)
     assert image[:, 1].max() < 0.75
     assert image[:, 20:].min() > 0.98

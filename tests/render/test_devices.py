@@ -19,8 +19,8 @@ from lerobot_msdyn.priors import PointTracks, Priors
 from lerobot_msdyn.priors.camera.stands import Stand, Stands
 from lerobot_msdyn.reconstruction.background import EmptyScene, background_gaussians
 from lerobot_msdyn.reconstruction.evidence import evidence_of
-from lerobot_msdyn.reconstruction.key_views import fixed_view
 from lerobot_msdyn.reconstruction.fit import FitResult, fit
+from lerobot_msdyn.reconstruction.key_views import fixed_view
 from lerobot_msdyn.reconstruction.make_overlay import unexplained
 from lerobot_msdyn.reconstruction.result import FittedWindow, Reconstruction
 from lerobot_msdyn.reconstruction.self_check import self_check

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Float64, UInt8
 from numpy import ndarray
 from torch import Tensor

@@ -30,7 +30,8 @@ _MIN_SHARE = 0.5  # of the registered frames
 def camera_from_sfm(view: View, instances: UInt8[Tensor, "t h w"]) -> CameraTrack:
     """The camera at every frame; the first one's frame is the world's, and the unit of length is arbitrary.
 
-    The focal length is that of `view.camera`, refined where it is only assumed. Frames between registered ones are interpolated.
+    The focal length is that of `view.camera`, refined where it is only assumed. Frames between
+    registered ones are interpolated.
 
     Raises:
         PriorError: pycolmap is absent, the camera does not move, or too few frames could be registered.

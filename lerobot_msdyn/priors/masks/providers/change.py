@@ -8,7 +8,6 @@ from lerobot_msdyn.priors.masks.moving import moving_instances, temporal_median
 from lerobot_msdyn.priors.registry import MASKS, Estimate, MaskProvider, Masks
 from lerobot_msdyn.priors.request import Request
 
-
 CHANGE = "change"  # the name of the provider
 
 
