@@ -50,6 +50,7 @@ from lerobot_msdyn.evaluate.metrics import masked_psnr_db
 from lerobot_msdyn.priors import Priors, estimate_priors
 from lerobot_msdyn.reconstruction.background import EmptyScene, empty_scene
 from lerobot_msdyn.reconstruction.fit import fit
+from lerobot_msdyn.reconstruction.key_views import fixed_view
 from lerobot_msdyn.reconstruction.reconstruct import Draft, reconstruct, with_steps
 from lerobot_msdyn.reconstruction.result import Reconstruction
 from lerobot_msdyn.render.cpu.threads import torch_on_one_thread

@@ -169,6 +169,8 @@ def _laid(source: Source, key: Source) -> Float32[ndarray, "h w"]:
 
 def _sampled(picture: UInt8[ndarray, "h w 3"], xy: Float[Tensor, "n 2"]) -> UInt8[ndarray, "n 3"]:
     """Colours between pixels (cubic)."""
+    if len(xy) == 0:
+        return np.zeros((0, 3), np.uint8)
     places = np.nan_to_num(xy.numpy().astype(np.float32)) - 0.5
     columns = 1024  # rows of points: OpenCV takes no image side over 32767
     padded = np.pad(places, ((0, -len(places) % columns), (0, 0))).reshape(-1, columns, 2)

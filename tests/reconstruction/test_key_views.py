@@ -80,6 +80,13 @@ def test_a_held_out_camera_sees_the_desk_as_it_is(
     assert -10 * np.log10(np.mean(errors)) > 20  # dB, before any fit, at 96 px
 
 
+def test_without_any_depth_there_is_a_guess(walked: tuple[SyntheticScene, View, Priors]) -> None:
+    _, view, priors = walked
+    (key,) = key_views(view, replace(priors, depth=torch.zeros_like(priors.depth)))
+    assert key.empty.seen.max() == 0
+    assert torch.isfinite(static_gaussians([key], 100).means).all()
+
+
 def test_depth_that_few_frames_have_is_no_surface(walked: tuple[SyntheticScene, View, Priors]) -> None:
     _, view, priors = walked
     depth = priors.depth.clone()
