@@ -127,8 +127,8 @@ class SceneConfig:
 
     # Whether what one episode never shows of a fixed camera's background is taken from the others.
     shared_background: bool = True
-    # Upper bound for the static set (before a camera that moves: for each key view); one Gaussian per pixel of the fitted
-    # image where it suffices.
+    # Upper bound for the static set (before a camera that moves: for each key view); one Gaussian per pixel of the
+    # fitted image where it suffices.
     static_gaussians: int = between(80_000, 100, 10_000_000)
     # Upper bound for the moving set.
     moving_gaussians: int = between(20_000, 0, 10_000_000)

@@ -9,8 +9,8 @@ from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.corners import away_from, corners_followed
 from lerobot_msdyn.core.errors import PriorError
-from lerobot_msdyn.priors.camera.steadiness import corners_followed
 from lerobot_msdyn.priors.registry import Depth
 
 _PAIRS = 40  # pairs of frames that are looked at
@@ -57,7 +57,7 @@ def _factors(
 ) -> Float64[ndarray, "n 2"]:
     """Of each corner of a frame that is found in another: the factor, and the weight by which to trust it."""
     grey = [cv2.cvtColor(rgb[frame].numpy(), cv2.COLOR_RGB2GRAY) for frame in (one, other)]
-    corners, followed = corners_followed(grey[0], grey[1], (instances[one] > 0).numpy())
+    corners, followed = corners_followed(grey[0], grey[1], away_from((instances[one] > 0).numpy()))
     row, column = corners.astype(int)[:, ::-1].T
     z = depth.z[one].numpy()[row, column].astype(np.float64)
     corners, followed, z = corners[z > 0] + 0.5, followed[z > 0] + 0.5, z[z > 0]

@@ -16,8 +16,8 @@ from numpy import ndarray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from lerobot_msdyn.core.corners import corners_followed
 from lerobot_msdyn.core.errors import PriorError
-from lerobot_msdyn.priors.camera.steadiness import corners_followed
 
 GAPS_S = (0.4, 0.8, 1.2)  # from a frame to the others in which its corners are looked for
 STARTS = 40  # frames, evenly spread, whose corners are followed
@@ -117,12 +117,11 @@ def _starts(focal_px: float) -> list[Float64[ndarray, "9"]]:
 def _matches(rgb: UInt8[ndarray, "t h w 3"], fps: int | float) -> tuple[ndarray, ndarray, ndarray, ndarray]:
     """Frames and places (px) of corners, two by two."""
     grey = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in rgb]
-    nothing = np.zeros(grey[0].shape, bool)
     parts: list[tuple[ndarray, ...]] = []
     for gap in sorted({max(1, round(seconds * fps)) for seconds in GAPS_S}):
         for start in np.unique(np.linspace(0, max(len(rgb) - 1 - gap, 0), STARTS).round().astype(int)).tolist():
             if start + gap < len(rgb):
-                here, there = corners_followed(grey[start], grey[start + gap], nothing)
+                here, there = corners_followed(grey[start], grey[start + gap])
                 count = len(here)
                 parts.append((np.full(count, start), np.full(count, start + gap), here + 0.5, there + 0.5))
     if not parts:
