@@ -50,6 +50,7 @@ from lerobot_msdyn.evaluate.metrics import masked_psnr_db
 from lerobot_msdyn.priors import Priors, estimate_priors
 from lerobot_msdyn.reconstruction.background import EmptyScene, empty_scene
 from lerobot_msdyn.reconstruction.fit import fit
+from lerobot_msdyn.reconstruction.key_views import fixed_view
 from lerobot_msdyn.reconstruction.reconstruct import Draft, reconstruct, with_steps
 from lerobot_msdyn.reconstruction.result import Reconstruction
 from lerobot_msdyn.render.cpu.threads import torch_on_one_thread
@@ -173,7 +174,7 @@ def reconstructed(prepared: Prepared, row: Row, recipe: Recipe) -> Reconstructio
         draft.priors = prepared.priors
 
     def given_background(draft: Draft) -> None:
-        draft.stand_before(prepared.empty)
+        draft.stand_before(fixed_view(prepared.empty, draft.view.camera))
 
     def fitted(draft: Draft) -> None:
         scene = draft.scene
@@ -185,7 +186,7 @@ def reconstructed(prepared: Prepared, row: Row, recipe: Recipe) -> Reconstructio
             draft.view,
             draft.priors,
             recipe.fit,
-            empty=draft.empty.rgb,
+            empty=draft.keys[0].empty.rgb,
             distance=draft.distance,
             seed=recipe.seed,
             learned=learned,

@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -17,10 +16,11 @@ from lerobot_msdyn.dataset.read import open_source, read_episode
 from lerobot_msdyn.dataset.select import select_cameras
 from lerobot_msdyn.priors import Priors, estimate_priors
 from lerobot_msdyn.priors.exchange import from_priors, write_exchange
+from lerobot_msdyn.synthetic.rough_depth import rough_depth
 
 CORRUPTIONS = ("none", "wrong_depth", "wrong_sensor", "too_few_steps", "broken_masks", "lost_tracks")
 FEW_STEPS = 1
-BIAS, FRAME_BIAS, FRAME_SCALE = 0.06, 0.01, 0.02  # standard deviations of the logarithm of wrong depth
+WORSE = 2.0  # times the errors of a usual network
 MASKS_LOST = 0.4  # share of the frames whose mask is empty; the others' are shifted
 MASK_SHIFT = 0.03  # of the width
 TRACKS_KEPT = 0.3  # share of the clip after which every track is lost
@@ -86,20 +86,8 @@ def clean_priors(view: View, recipe: Recipe) -> Priors:
 
 
 def wrong_depth(depth: Float[ndarray, "t h w"], rng: np.random.Generator) -> Float[ndarray, "t h w"]:
-    """Depth (m) as a poor network would give it: edges blurred, a bias that stays, one that changes, and flicker."""
-    height, width = depth.shape[1:]
-
-    def smooth(sigma: float) -> ndarray:
-        coarse = rng.normal(0, sigma, (6, 8)).astype(np.float32)
-        return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
-
-    bias = smooth(BIAS)
-    found = np.zeros_like(depth)
-    for frame, true in enumerate(depth):
-        inverse = cv2.resize(1 / np.maximum(true, 0.05), (width // 2, height // 2), interpolation=cv2.INTER_AREA)
-        inverse = cv2.resize(inverse, (width, height), interpolation=cv2.INTER_LINEAR)
-        found[frame] = 1 / (inverse * np.exp(bias + smooth(FRAME_BIAS) + rng.normal(0, FRAME_SCALE)))
-    return found
+    """Depth (m) as a poor network would give it."""
+    return rough_depth(depth, rng, worse=WORSE)
 
 
 def broken_masks(instances: ndarray, rng: np.random.Generator) -> ndarray:

@@ -15,7 +15,7 @@ from lerobot_msdyn.augment.backgrounds import background_episodes
 from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.augment.cost import check_disk
 from lerobot_msdyn.augment.failures import one_line_each
-from lerobot_msdyn.augment.moving_cameras import still_cameras
+from lerobot_msdyn.augment.moving_cameras import cameras_off_the_gripper, still_cameras
 from lerobot_msdyn.augment.report.build import entries_of, write_report
 from lerobot_msdyn.augment.report.page import accounts_of
 from lerobot_msdyn.augment.robot_cameras import calibration_episodes, publish
@@ -41,7 +41,7 @@ class Opened:
 
 
 def open_job(config: AugmentConfig, root: Path | None) -> Opened:
-    """The source, its episodes, and those of its cameras that stand still.
+    """The source, its episodes, and those of its cameras that are re-rendered: that stand still, or may move.
 
     Raises:
         DatasetError: there is no such dataset, episode or camera, or none that can be read.
@@ -49,7 +49,9 @@ def open_job(config: AugmentConfig, root: Path | None) -> Opened:
     source = open_source(config.repo_id, root, config.tolerance_s)
     episodes = select_episodes(source, config.episodes)
     cameras = select_cameras(source, config.cameras, allow_moving=config.allow_moving)
-    if not config.allow_moving:
+    if config.allow_moving:
+        cameras = cameras_off_the_gripper(source, cameras, config)
+    else:
         cameras = still_cameras(source, episodes, cameras, config)
     return Opened(source, episodes, cameras)
 

@@ -16,6 +16,7 @@ from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import DatasetError, EpisodeError
 from lerobot_msdyn.core.sampling import evenly, scaled_px
 from lerobot_msdyn.dataset.read import Episode
+from lerobot_msdyn.dataset.select import is_wrist_camera
 from lerobot_msdyn.priors.camera.steadiness import SWAY_PX, camera_motion_px
 from lerobot_msdyn.reconstruction.windows import seen_stands
 
@@ -48,6 +49,29 @@ def still_cameras(
             raise DatasetError(message)
         logger.warning(message)
     return [key for key in cameras if key not in moving]
+
+
+def cameras_off_the_gripper(source: LeRobotDatasetMetadata, cameras: list[str], recipe: Recipe) -> list[str]:
+    """Those of the cameras that do not ride on the gripper, by their names; the others are copied as they are.
+
+    A displaced picture of these is one of another state: the action that was recorded does not lead on from it, and no
+    rule here makes another one (as SPARTN and DMD do for policies that act in the gripper's own frame).
+
+    Raises:
+        DatasetError: the recipe names one, or no camera is left and recorded episodes are not asked for.
+    """
+    on_gripper = [key for key in cameras if is_wrist_camera(key)]
+    refused = recipe.cameras is not None or (len(on_gripper) == len(cameras) and not recipe.include_source)
+    for key in on_gripper:
+        message = (
+            f"{source.repo_id}: {key} is {'refused' if refused else 'copied'}, also with --allow_moving: it rides on "
+            "the gripper, by its name; a displaced view would be one of another state, to which the recorded actions "
+            "do not belong"
+        )
+        if refused:
+            raise DatasetError(f"{message}; leave it out of --cameras")
+        logger.warning(message)
+    return [key for key in cameras if key not in on_gripper]
 
 
 def _first_readable(

@@ -50,6 +50,8 @@ class CameraConfig:
     by_robot: bool = True
     # auto (the calibration, else fixed), fixed, sfm (pycolmap, for a moving camera), or an .npz file with K and w2c.
     poses: str = one_of(AUTO, (AUTO,), registry=CAMERAS)
+    # Whether the poses of a camera that moves are refined: each frame is laid over what stands still.
+    refine_poses: bool = True
     # Horizontal field of view in degrees, used where no calibration names the camera.
     horizontal_fov_deg: float = between(60.0, 5, 170)
     # Look for the field of view at which rigid things keep their size; needs depth other than the plane's.
@@ -125,7 +127,8 @@ class SceneConfig:
 
     # Whether what one episode never shows of a fixed camera's background is taken from the others.
     shared_background: bool = True
-    # Upper bound for the static set; one Gaussian per pixel of the fitted image where it suffices.
+    # Upper bound for the static set (before a camera that moves: for each key view); one Gaussian per pixel of the
+    # fitted image where it suffices.
     static_gaussians: int = between(80_000, 100, 10_000_000)
     # Upper bound for the moving set.
     moving_gaussians: int = between(20_000, 0, 10_000_000)
@@ -371,7 +374,7 @@ class Recipe:
     crop_to_covered: bool = False
     # Keep masks of what was not seen, per frame, in meta/msdyn/unseen/.
     masks: bool = False
-    # Whether cameras that move with the robot may be re-rendered; their pictures are tied to its state.
+    # Whether cameras that move, in a hand or on a head, may be re-rendered; those on the gripper are copied always.
     allow_moving: bool = False
     gate: GateConfig = field(default_factory=GateConfig)
 

@@ -28,6 +28,7 @@ RECIPE = FOLDER / "recipe.yaml"
 CALIBRATION = "calibration"  # in FOLDER: what the robot's joints say of the cameras
 AT_ONCE = 1000  # rows that are plain values before they are a table, which takes a tenth of the memory
 SOURCE_VARIANT = -1  # the variant of an episode that was copied, not rendered
+SAME = 3e-6  # m, px, or of a matrix: poses are kept in single precision, and what differs by less is the same
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,8 @@ def camera_pose(source: CameraTrack, new: CameraTrack) -> dict[str, Any]:
 
 def _once(matrices: Float[Tensor, "t n n"]) -> list[Any]:
     rounded = (matrices.double() * 1e6).round() / 1e6
-    return list((rounded[0] if bool((rounded == rounded[:1]).all()) else rounded).tolist())
+    same = bool(((matrices - matrices[:1]).abs() <= SAME).all())
+    return list((rounded[0] if same else rounded).tolist())
 
 
 def write_unseen(root: Path, index: int, masks: Mapping[str, np.ndarray]) -> None:

@@ -70,7 +70,7 @@ def select_cameras(meta: LeRobotDatasetMetadata, cameras: list[str] | None, *, a
     if on_robot and not allow_moving:
         raise DatasetError(
             f"{meta.repo_id}: {', '.join(on_robot)} moves with the robot, by its name: its picture is tied to the "
-            "state, and would belong to another one; leave it out, or allow it by --allow_moving"
+            "state, and would belong to another one; leave it out"
         )
     return chosen
 

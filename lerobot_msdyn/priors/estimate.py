@@ -4,17 +4,24 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
+from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.config import CameraConfig, Device, PriorsConfig
 from lerobot_msdyn.core.observations import Origin, Priors, View
-from lerobot_msdyn.priors.cache import open_cache
+from lerobot_msdyn.priors.cache import digest_of, open_cache
 from lerobot_msdyn.priors.camera.field_of_view import with_searched_fov
+from lerobot_msdyn.priors.camera.scale import scaled_to_depth
+from lerobot_msdyn.priors.camera.sfm import SFM
 from lerobot_msdyn.priors.depth.lying import with_lying
 from lerobot_msdyn.priors.from_file import CameraFile, DepthFile, MaskFile, TrackFile
+from lerobot_msdyn.priors.masks.moving import instances_before
+from lerobot_msdyn.priors.masks.providers.change import CHANGE
 from lerobot_msdyn.priors.provide import provide
-from lerobot_msdyn.priors.registry import CameraProvider, DepthProvider, MaskProvider, Masks, TrackProvider
+from lerobot_msdyn.priors.registry import CameraProvider, Depth, DepthProvider, MaskProvider, Masks, TrackProvider
 from lerobot_msdyn.priors.request import Request
 from lerobot_msdyn.priors.robot import with_robot, with_robot_depth
 from lerobot_msdyn.render.devices import chosen_device
@@ -62,6 +69,12 @@ def estimate_priors(
     depth, depth_from = provide(
         DepthProvider, config.depth, posed, lambda provider: provider.estimate(posed, instances), file=DepthFile
     )
+    if camera_from.provider == SFM:
+        pinhole, factor = scaled_to_depth(pinhole, view.rgb, depth, instances)
+        camera_from = replace(camera_from, why=f"{camera_from.why}; shifts times {factor:.4g}, by the depth")
+    if masks_from.provider == CHANGE and not pinhole.is_static and not depth.traits.assumed:
+        instances = _before_poses(request, pinhole, depth)
+        masks_from = replace(masks_from, why=f"{masks_from.why}; by poses and depth")
     tracks, tracks_from = provide(
         TrackProvider, config.tracks, posed, lambda provider: provider.estimate(posed, instances), file=TrackFile
     )
@@ -96,6 +109,17 @@ def estimate_masks(
     cache, networks_on = open_cache(config.cache, view.rgb), chosen_device(device, networks=True).type
     instances = _masks(Request(view, config, camera, cache, (), elsewhere, episode, key, networks_on))[0]
     return instances if view.robot is None else with_robot(instances, view.robot)[0]
+
+
+def _before_poses(request: Request, camera: CameraTrack, depth: Depth) -> Masks:
+    """What moves before a camera that moves, by its poses and depth."""
+
+    def compute() -> dict[str, np.ndarray]:
+        return {"masks": instances_before(request.view.rgb, depth.z, camera).numpy()}
+
+    poses = camera.world_from_camera, camera.intrinsics, depth.z
+    settings = {"seen": [digest_of(part.contiguous().view(torch.uint8)) for part in poses]}
+    return torch.from_numpy(request.cache.get("masks", "poses", settings, compute)["masks"])
 
 
 def _masks(request: Request) -> tuple[Masks, Origin]:

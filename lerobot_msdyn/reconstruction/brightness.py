@@ -1,5 +1,7 @@
 """How brightness changes over time: of the static set by the video alone, of the moving set by a rendered scene."""
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 import torch
@@ -7,13 +9,14 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from numpy import ndarray
 from torch import Tensor
 
+from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.geometry import invert_se3, nearest_pixel, transform_points, unproject_image
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.core.sampling import scaled_px, scaled_window
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.core.visibility import projected
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.scene.dynamic import DynamicScene
-from lerobot_msdyn.scene.gaussians import Gaussians
 from lerobot_msdyn.scene.rendering import render_scene
 from lerobot_msdyn.scene.shading import Shading, encode_gain, no_shading
 
@@ -25,29 +28,42 @@ SURE_WEIGHT = 0.5  # share of the blur's window that must be known
 MOVING_STEP = 2  # the moving set is measured at every second frame, and over three of these
 
 
-def static_shading(
-    static: Gaussians, moving: int, view: View, priors: Priors, empty: UInt8[Tensor, "h w 3"]
-) -> Shading:
-    """Shading of the static set of a fixed camera; that of the `moving` others is one.
+def static_shading(scene: DynamicScene, view: View, priors: Priors, empty: UInt8[Tensor, "h w 3"]) -> Shading:
+    """Shading of the static set of a scene on the host; that of the moving set is one.
 
-    The gain of a pixel is the ratio of the frame to the `empty` scene, both without what moves, blurred over pixels and
-    averaged over three frames. Behind what moves it is that of its surroundings.
+    The gain of a pixel is the ratio of the frame to what stands still there, both without what moves, blurred over
+    pixels and averaged over three frames. Behind what moves it is that of its surroundings.
+
+    Args:
+        scene: before the fit.
+        view: the video.
+        priors: what moves in it.
+        empty: what a fixed camera sees where nothing moves; before one that moves, the static set is rendered.
     """
     frames = len(view.rgb)
-    if not view.camera.is_static:
-        return no_shading(len(static), moving, frames)
-    still = _grey(empty.numpy())
-    sums = [_field_sums(view, priors, still, t) for t in range(min(2, frames))]
+    if view.camera.is_static:
+        still = _grey(empty.numpy())
+        camera = view.camera.select([0])
+        places = projected(scene.static.means, camera).xy / torch.tensor([camera.width, camera.height]) * 2 - 1
+
+        def sums_of(frame: int) -> Float32[ndarray, "a b 3"]:
+            return _field_sums(view, priors, still, frame)
+    else:
+        around = _Directions.of(scene.static.means, view.camera)
+        places = around.places(scene.static.means)
+
+        def sums_of(frame: int) -> Float32[ndarray, "a b 3"]:
+            return _rendered_sums(scene, view, priors, frame, around)
+
+    sums = [sums_of(t) for t in range(min(2, frames))]
     fields = []
     for t in range(frames):
         fields.append(encode_gain(torch.from_numpy(_ratio(np.sum(sums, axis=0)))))
         if t + 2 < frames:
-            sums.append(_field_sums(view, priors, still, t + 2))
+            sums.append(sums_of(t + 2))
         if t > 0:
             del sums[0]
-    camera = view.camera.select([0])
-    places = projected(static.means, camera).xy / torch.tensor([camera.width, camera.height]) * 2 - 1
-    return Shading(torch.stack(fields), places, no_shading(0, moving, frames).moving)
+    return Shading(torch.stack(fields), places, no_shading(0, len(scene.moving), frames).moving)
 
 
 def _field_sums(view: View, priors: Priors, empty: Float32[ndarray, "h w"], frame: int) -> Float32[ndarray, "a b 3"]:
@@ -58,6 +74,71 @@ def _field_sums(view: View, priors: Priors, empty: Float32[ndarray, "h w"], fram
     sums = _blurred_sums(_grey(view.rgb[frame].numpy()), empty, still)
     size = (-(-width // FIELD_STEP), -(-height // FIELD_STEP))
     return cv2.resize(sums, size, interpolation=cv2.INTER_AREA)
+
+
+@dataclass(frozen=True)
+class _Directions:
+    """A picture of all directions in which a moving camera sees the static set from its usual place.
+
+    What it maps does not move when the camera does.
+    """
+
+    camera_from_world: Float[Tensor, "4 4"]  # of the usual place
+    low: Float[Tensor, "2"]  # rad, the smallest azimuth and elevation ...
+    high: Float[Tensor, "2"]  # ... and the largest
+    width: int
+    height: int
+
+    @classmethod
+    def of(cls, means: Float[Tensor, "g 3"], camera: CameraTrack) -> "_Directions":
+        """With pixels of about the size of a fixed camera's field of gains."""
+        pose = camera.world_from_camera[len(camera) // 2].clone()
+        pose[:3, 3] = camera.world_from_camera[:, :3, 3].median(0).values
+        from_world = invert_se3(pose)
+        angles = _angles(transform_points(from_world, means))
+        low, high = angles.amin(0), angles.amax(0)
+        width, height = ((high - low) * float(camera.intrinsics[0, 0, 0]) / FIELD_STEP).ceil().clamp(1, 2048).tolist()
+        return cls(from_world, low, high, int(width), int(height))
+
+    def places(self, points: Float[Tensor, "g 3"]) -> Float[Tensor, "g 2"]:
+        """Where points (m, world) are in the picture, -1..1."""
+        angles = _angles(transform_points(self.camera_from_world, points))
+        return (angles - self.low) / (self.high - self.low).clamp(min=1e-6) * 2 - 1
+
+    def gathered(
+        self, points: Float[Tensor, "g 3"], values: Float32[ndarray, "g c"]
+    ) -> Float32[ndarray, "{self.height} {self.width} c"]:
+        """The sums of some values of points in each pixel."""
+        shares = (self.places(points) + 1) / 2 * torch.tensor([self.width, self.height])
+        row, column = nearest_pixel(shares, self.width, self.height)
+        out = np.zeros((self.height * self.width, values.shape[1]), np.float32)
+        np.add.at(out, (row * self.width + column).numpy(), values)
+        return out.reshape(self.height, self.width, -1)
+
+
+def _angles(points: Float[Tensor, "g 3"]) -> Float[Tensor, "g 2"]:
+    """Azimuth and elevation (rad) of points in a camera's axes."""
+    x, y, z = points.unbind(-1)
+    return torch.stack((torch.atan2(x, z), torch.atan2(y, torch.hypot(x, z))), dim=-1)
+
+
+@torch.no_grad()
+def _rendered_sums(
+    scene: DynamicScene, view: View, priors: Priors, frame: int, around: _Directions
+) -> Float32[ndarray, "a b 3"]:
+    """As `_field_sums`, of the static set as it is rendered, in the picture of all directions."""
+    camera = view.camera.select([frame])
+    rendered = render_scene(scene.still(), camera, torch.tensor([frame]))
+    window = scaled_window(MASK_MARGIN_PX, view.camera.width)
+    still = cv2.dilate((priors.instances[frame] > 0).numpy().astype(np.uint8), window) == 0
+    still &= (rendered.alpha[0] > SURE_WEIGHT).numpy()
+    sums = _blurred_sums(_grey(view.rgb[frame].numpy()), _grey(255 * rendered.rgb[0].numpy()), still)
+    offset = FIELD_STEP // 2
+    take = (slice(offset, None, FIELD_STEP), slice(offset, None, FIELD_STEP))
+    points = unproject_image(rendered.depth[0], camera.intrinsics[0])[take].reshape(-1, 3)
+    known = (rendered.depth[0][take] > 0).reshape(-1)
+    in_world = transform_points(camera.world_from_camera[0], points[known])
+    return around.gathered(in_world, sums[take].reshape(-1, 3)[known.numpy()])
 
 
 def _blurred_sums(

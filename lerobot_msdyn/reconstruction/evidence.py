@@ -1,17 +1,19 @@
 """What the recorded camera has shown of a fitted scene, made when it is fitted, used when new views are drawn."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.cameras import CameraTrack, concatenated
 from lerobot_msdyn.core.geometry import nearest_pixel
 from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.core.visibility import TOLERANCE, projected
-from lerobot_msdyn.reconstruction.background import EmptyScene, fill_depth
+from lerobot_msdyn.reconstruction.background import fill_depth
+from lerobot_msdyn.reconstruction.key_views import KeyView
 from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.rendering import render_scene
 
@@ -23,16 +25,17 @@ class Evidence:
     """What the recorded camera has shown of a scene."""
 
     camera: CameraTrack  # at the size at which the scene was fitted, one pose per frame of the scene
-    depth: Float[Tensor, "h w"]  # m, of what stands still; known or guessed everywhere
-    frames: Int[Tensor, "h w"]  # that show what stands still there; 0 = filled from around
+    keys: CameraTrack  # places from which all that stands still is seen, at the same size; one of a fixed camera
+    depth: Float[Tensor, "k h w"]  # m, of what stands still, from each; known or guessed everywhere
+    frames: Int[Tensor, "k h w"]  # that show what stands still there; 0 = filled from around
     moving_frames: Float[Tensor, " m"]  # frames that show each moving Gaussian
 
 
 @torch.no_grad()
-def evidence_of(scene: DynamicScene, camera: CameraTrack, empty: EmptyScene) -> Evidence:
-    """What `camera` has shown of a scene: of what stands still as `empty` says, of what moves as the scene says.
+def evidence_of(scene: DynamicScene, camera: CameraTrack, keys: Sequence[KeyView]) -> Evidence:
+    """What `camera` has shown of a scene: of what stands still as the key views say, of what moves as the scene says.
 
-    It is on the device of the scene, as the camera and `empty` need not be.
+    It is on the device of the scene, as the camera and the key views need not be.
     """
     visible = torch.zeros(len(scene.moving), device=scene.device)
     frames = evenly(scene.frames, SAMPLES)
@@ -42,7 +45,9 @@ def evidence_of(scene: DynamicScene, camera: CameraTrack, empty: EmptyScene) -> 
             means = scene.at(frame).means[0, len(scene.static) :]
             depth = render_scene(scene, pose, frame).depth[0]
             visible += in_front(means, pose, depth, torch.ones_like(depth)).float()
-    shown = to_device((camera, fill_depth(empty.depth), empty.seen), scene.device)
+    depth = torch.stack([fill_depth(key.empty.depth) for key in keys])
+    seen = torch.stack([key.empty.seen for key in keys])
+    shown = to_device((camera, concatenated([key.camera for key in keys]), depth, seen), scene.device)
     return Evidence(*shown, visible * (scene.frames / len(frames)))
 
 
@@ -64,8 +69,21 @@ def in_front(
     return torch.where(seen.inside & (seen.z <= farthest * (1 + TOLERANCE)), most, 0).long()
 
 
+def still_frames(evidence: Evidence, points: Float[Tensor, "n 3"]) -> Int[Tensor, " n"]:
+    """Number of frames that show each of some surface points (m, world) of what stands still."""
+    seen = [
+        in_front(points, evidence.keys.select([i]), depth, frames)
+        for i, (depth, frames) in enumerate(zip(evidence.depth, evidence.frames, strict=True))
+    ]
+    return torch.stack(seen).amax(0)
+
+
 def is_behind(evidence: Evidence, places: Float[Tensor, "n 3"]) -> bool:
-    """Whether any of some places (m, world) is behind what stands still before the recorded camera."""
-    camera = evidence.camera.select(slice(1))
-    seen = projected(places.to(evidence.depth.device), camera)
-    return bool((seen.inside & (seen.z > evidence.depth[seen.pixel])).any())
+    """Whether any of some places (m, world) is behind what stands still, from wherever the recorded camera saw it."""
+    places = places.to(evidence.depth.device)
+    inside, hidden = torch.zeros(2, len(places), dtype=torch.long, device=places.device)
+    for i, depth in enumerate(evidence.depth):
+        seen = projected(places, evidence.keys.select([i]))
+        inside += seen.inside
+        hidden += seen.inside & (seen.z > depth[seen.pixel])
+    return bool(((inside > 0) & (hidden == inside)).any())

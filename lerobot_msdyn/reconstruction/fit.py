@@ -69,7 +69,7 @@ def fit(
         view: the video, at the size at which it is fitted; on the host.
         priors: its priors, at the same size; on the host.
         config: steps, weights of the loss terms in use, and learning rates.
-        empty: what the camera sees where nothing moves, by which brightness is measured.
+        empty: what a fixed camera sees where nothing moves, by which brightness is measured.
         distance: distance to the look-at point (m), the unit of the means' learning rate.
         seed: fixes the order of the frames.
         backend: of the rasterizer.
@@ -82,7 +82,7 @@ def fit(
     """
     start = time.perf_counter()
     if config.shadows:
-        shading = static_shading(to_device(scene.static, "cpu"), len(scene.moving), view, priors, empty)
+        shading = static_shading(to_device(scene, "cpu"), view, priors, empty)
         scene = replace(scene, shading=to_device(shading, scene.device))
     if config.sh_degree > 0:
         scene = replace(scene, moving=with_slope(scene.moving))

@@ -1,6 +1,7 @@
 """From priors to a scene: a static set from the empty scene, and a moving set gathered from several frames."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -17,13 +18,8 @@ from lerobot_msdyn.core.visibility import projected
 from lerobot_msdyn.motion.estimate import SceneMotion, scene_motion
 from lerobot_msdyn.motion.to_video.register import Recording
 from lerobot_msdyn.priors import Priors
-from lerobot_msdyn.reconstruction.background import (
-    EmptyScene,
-    background_gaussians,
-    empty_scene,
-    fill_depth,
-    pixel_gaussians,
-)
+from lerobot_msdyn.reconstruction.background import fill_depth, pixel_gaussians
+from lerobot_msdyn.reconstruction.key_views import KeyView, key_views, static_gaussians
 from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.gaussians import Gaussians, concatenate, isotropic
 
@@ -37,7 +33,7 @@ EDGE_JUMP = 0.03  # relative difference of neighbouring depths beyond which a pi
 
 
 def initialise(
-    view: View, priors: Priors, scene: SceneConfig, motion: MotionConfig, empty: EmptyScene | None = None
+    view: View, priors: Priors, scene: SceneConfig, motion: MotionConfig, keys: Sequence[KeyView] = ()
 ) -> DynamicScene:
     """A scene ready to be fitted.
 
@@ -46,11 +42,9 @@ def initialise(
         priors: its priors, at the same size.
         scene: numbers of Gaussians.
         motion: the levels of motion.
-        empty: what stands still; default: as this video shows it.
+        keys: what stands still; default: as this video shows it.
     """
-    if empty is None:
-        empty = empty_scene(view.rgb, priors.depth, priors.instances)
-    static = background_gaussians(empty.rgb, empty.depth, view.camera, scene.static_gaussians)
+    static = static_gaussians(keys or key_views(view, priors), scene.static_gaussians)
     estimated = _motion(view, priors, motion) if scene.moving_gaussians > 0 else None
     if estimated is None:
         moving = static.select(torch.zeros(0, dtype=torch.long))

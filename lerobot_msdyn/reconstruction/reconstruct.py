@@ -20,11 +20,13 @@ from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.dataset.provenance import merged
 from lerobot_msdyn.priors import estimate_priors
 from lerobot_msdyn.priors.camera.path import CameraPath
+from lerobot_msdyn.reconstruction.align_poses import aligned_poses
 from lerobot_msdyn.reconstruction.antialias import enlarged
-from lerobot_msdyn.reconstruction.background import NEAR, EmptyScene, empty_scene, look_at_distance
+from lerobot_msdyn.reconstruction.background import NEAR, look_at_distance
 from lerobot_msdyn.reconstruction.evidence import Evidence, evidence_of
 from lerobot_msdyn.reconstruction.fit import FitResult, fit
 from lerobot_msdyn.reconstruction.initialise import initialise
+from lerobot_msdyn.reconstruction.key_views import KeyView, fixed_view, key_views
 from lerobot_msdyn.reconstruction.make_overlay import unexplained
 from lerobot_msdyn.reconstruction.pooled_background import SharedBackground, adapted, completed
 from lerobot_msdyn.reconstruction.prune import without_contradicted
@@ -57,7 +59,7 @@ class Draft:
     path: CameraPath | None = None  # from the camera's usual place to where it is at each frame; None: it keeps still
     shared: SharedBackground | None = None  # the one that fits this window
     priors: Priors = field(init=False)
-    empty: EmptyScene = field(init=False)
+    keys: Sequence[KeyView] = field(init=False)  # what stands still
     distance: float = field(init=False)  # m, to the look-at point
     up: tuple[float, float, float] = field(init=False)  # the vertical in the camera's axes
     scene: DynamicScene = field(init=False)
@@ -66,12 +68,16 @@ class Draft:
     self_check: SelfCheck = field(init=False)
     seconds: dict[str, float] = field(default_factory=dict)  # by step
 
-    def stand_before(self, empty: EmptyScene) -> None:
+    def stand_before(self, keys: Sequence[KeyView]) -> None:
         """Take what stands still as given, and how the camera stands to it."""
-        self.empty = empty
-        self.distance = look_at_distance(empty.depth)
+        self.keys = keys
+        depth = keys[0].empty.depth
+        self.distance = look_at_distance(depth)
         if self.view.robot is None:
-            self.up = up_of(empty.depth, self.view.camera.intrinsics[0], self.recipe.camera.tilt_deg)
+            up = up_of(depth, self.view.camera.intrinsics[0], self.recipe.camera.tilt_deg)
+            turn = self.view.camera.camera_from_world[0, :3, :3] @ keys[0].camera.world_from_camera[0, :3, :3]
+            x, y, z = up if self.view.camera.is_static else (turn @ torch.tensor(up)).tolist()
+            self.up = x, y, z
         else:  # its world's z axis
             x, y, z = self.view.camera.camera_from_world[0, :3, 2].tolist()
             self.up = x, y, z
@@ -99,21 +105,25 @@ def _priors(draft: Draft) -> None:
     draft.view = replace(draft.view, camera=draft.priors.camera or draft.view.camera)
     if shared is not None and shared.fits(draft.view):  # it may be another camera than was assumed at first
         draft.shared = shared
-    if not draft.view.camera.is_static:
-        logger.warning("the camera moves, but the empty scene is built as if it were fixed: expect blur")
 
 
 def _background(draft: Draft) -> None:
     """What the camera sees where nothing moves, and how it stands to it."""
-    empty = empty_scene(draft.view.rgb, draft.priors.depth, draft.priors.instances)
-    draft.stand_before(empty if draft.shared is None else completed(empty, draft.shared.empty, len(draft.view)))
+    keys = key_views(draft.view, draft.priors)
+    if draft.recipe.camera.refine_poses and not draft.view.camera.is_static:
+        distance = look_at_distance(keys[0].empty.depth)
+        draft.view = replace(draft.view, camera=aligned_poses(keys, draft.view, draft.priors, distance))
+        keys = key_views(draft.view, draft.priors)
+    if draft.shared is not None:
+        keys = fixed_view(completed(keys[0].empty, draft.shared.empty, len(draft.view)), draft.view.camera)
+    draft.stand_before(keys)
 
 
 def _initial_scene(draft: Draft) -> None:
     """Static and moving Gaussians, and the motion of the latter."""
-    scene = initialise(draft.view, draft.priors, draft.recipe.scene, draft.recipe.motion, draft.empty)
+    scene = initialise(draft.view, draft.priors, draft.recipe.scene, draft.recipe.motion, draft.keys)
     if draft.shared is not None and draft.shared.static is not None:
-        scene = replace(scene, static=adapted(draft.shared, draft.empty, scene.static))
+        scene = replace(scene, static=adapted(draft.shared, draft.keys[0].empty, scene.static))
     draft.scene = replace(scene, near=NEAR * draft.distance)
 
 
@@ -127,7 +137,7 @@ def _fit(draft: Draft) -> None:
         draft.view,
         draft.priors,
         config,
-        empty=draft.empty.rgb,
+        empty=draft.keys[0].empty.rgb,
         distance=draft.distance,
         seed=draft.recipe.seed,
         progress=lambda done: draft.progress(done / config.steps),
@@ -143,7 +153,7 @@ def _prune(draft: Draft) -> None:
 
 def _evidence(draft: Draft) -> None:
     """What the recorded camera has shown of the scene."""
-    draft.evidence = evidence_of(draft.scene, draft.view.camera, draft.empty)
+    draft.evidence = evidence_of(draft.scene, draft.view.camera, draft.keys)
 
 
 def _overlay(draft: Draft) -> None:

@@ -18,6 +18,7 @@ from lerobot_msdyn.priors.cache import code_digest, digest_of, open_cache
 from lerobot_msdyn.reconstruction.background import NEAR, look_at_distance
 from lerobot_msdyn.reconstruction.fit import fit
 from lerobot_msdyn.reconstruction.initialise import initialise
+from lerobot_msdyn.reconstruction.key_views import fixed_view
 from lerobot_msdyn.reconstruction.pooled_background import (
     MovingIn,
     SharedBackground,
@@ -84,7 +85,9 @@ def _fitted(background: SharedBackground, recipe: Recipe) -> SharedBackground:
     nothing = torch.zeros(1, *empty.seen.shape, dtype=torch.uint8)
     priors = Priors(empty.depth[None], nothing, _no_tracks(), DepthTraits(metric=True))
     view = View(empty.rgb[None], camera)
-    scene = initialise(view, priors, replace(recipe.scene, moving_gaussians=0), recipe.motion, empty)
+    scene = initialise(
+        view, priors, replace(recipe.scene, moving_gaussians=0), recipe.motion, fixed_view(empty, camera)
+    )
     pixel_by_pixel = replace(recipe.fit.density, enabled=False)  # as `adapted` expects it
     config = replace(recipe.fit, steps=recipe.fit.steps // 2, shadows=False, held_out_frames=0, density=pixel_by_pixel)
     try:

@@ -27,8 +27,9 @@ class Shading:
     """Brightness of the static and the moving set over time.
 
     What falls on a surface does not depend on who looks: gains belong to Gaussians, and are as valid from another
-    camera. For the static set they are kept as small images of the recorded camera, in which every Gaussian has its
-    place, so that memory does not grow with the number of Gaussians times the number of frames.
+    camera. For the static set they are kept as small images of the recorded camera (of all directions, where it moves),
+    in which every Gaussian has its place, so that memory does not grow with the number of Gaussians times the number of
+    frames.
     """
 
     field: UInt8[Tensor, "t h w"]  # gains of the static set, coded, in the recorded camera's image

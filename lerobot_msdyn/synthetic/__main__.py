@@ -38,6 +38,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--height", type=int, default=120, help="px")
     parser.add_argument("--fps", type=int, default=30)
     parser.add_argument("--sway_deg", type=float, default=4.0, help="of the camera, to either side (layout iphone)")
+    parser.add_argument(
+        "--network_depth", action="store_true", help="depth as a monocular network would give it (layout iphone)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="decides the desk's textures and clutter")
     return parser
 
@@ -53,7 +56,7 @@ def run(arguments: list[str]) -> int:
     elif a.layout == "nvs":
         write_nvs_folder(scenes[0], a.out)
     else:
-        write_iphone_folder(scenes[0], a.out, sway_deg=a.sway_deg)
+        write_iphone_folder(scenes[0], a.out, sway_deg=a.sway_deg, network_depth=a.network_depth)
     logger.info("wrote %d episode(s) of %d frames to %s", count, a.frames, a.out)
     return EXIT_OK
 

@@ -19,6 +19,7 @@ from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.errors import ConfigError, OutputError
 from lerobot_msdyn.core.geometry import matrix_to_quaternion
 from lerobot_msdyn.synthetic.nvs import covisibility
+from lerobot_msdyn.synthetic.rough_depth import rough_depth
 from lerobot_msdyn.synthetic.scene import SyntheticScene, SyntheticView
 from lerobot_msdyn.synthetic.viewpoints import hand_held_camera, heldout_cameras
 
@@ -30,8 +31,12 @@ PROCESSED = "flow3d_preprocessed"
 PINHOLE = 1  # COLMAP's number of that camera model
 
 
-def write_iphone_folder(scene: SyntheticScene, root: Path, every: int = 5, sway_deg: float = 4.0) -> None:
+def write_iphone_folder(
+    scene: SyntheticScene, root: Path, every: int = 5, sway_deg: float = 4.0, *, network_depth: bool = False
+) -> None:
     """Writes one sequence by a camera that sways by `sway_deg`; the validation cameras see every `every`-th frame.
+
+    With `network_depth` all depth is as a monocular network would give it (`rough_depth`).
 
     Raises:
         ConfigError: `every` is not positive, or the size is odd, so that there is no 2x.
@@ -48,7 +53,7 @@ def write_iphone_folder(scene: SyntheticScene, root: Path, every: int = 5, sway_
     sights = [Sight(0, hand_held, list(range(len(scene))))]
     sights += [Sight(number, still[name], frames) for number, name in enumerate(VALIDATION, start=1)]
     for factor in (1, 2):
-        _write_pictures(scene, [sight.smaller(factor) for sight in sights], root, factor)
+        _write_pictures(scene, [sight.smaller(factor) for sight in sights], root, factor, network_depth)
     for sight in sights:
         for i, name in enumerate(sight.names):
             _write_json(root / "camera" / f"{name}.json", _camera(sight.camera, i))
@@ -82,7 +87,7 @@ class Sight:
         return Sight(self.number, camera, self.frames)
 
 
-def _write_pictures(scene: SyntheticScene, sights: list[Sight], root: Path, factor: int) -> None:
+def _write_pictures(scene: SyntheticScene, sights: list[Sight], root: Path, factor: int, network_depth: bool) -> None:
     """Pictures, LiDAR-like depth and masks of one size; with those of full size, Shape of Motion's priors as well."""
     size = f"{factor}x"
     scene = replace(scene, cameras={**scene.cameras, "front": sights[0].camera})  # what is seen, is seen by this one
@@ -95,6 +100,9 @@ def _write_pictures(scene: SyntheticScene, sights: list[Sight], root: Path, fact
             seen = covisibility(scene, recorded.depth.numpy(), sight.camera, sight.frames) > 0
             package = f"{PROCESSED}/" if factor == 1 else ""
             _write_images(root / f"{package}covisible/{size}/val", sight.names, seen.astype(np.uint8) * 255)
+    if network_depth:
+        rough = rough_depth(recorded.depth.numpy(), np.random.default_rng(scene.seed))
+        recorded = replace(recorded, depth=torch.from_numpy(rough))
     _write_arrays(root / "depth" / size, sights[0].names, recorded.depth.numpy()[..., None])
     if factor == 1:
         _write_priors(scene, recorded, sights[0].names, root / PROCESSED)

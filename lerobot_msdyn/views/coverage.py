@@ -15,7 +15,7 @@ from torch import Tensor
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.geometry import transform_points, unproject_image
 from lerobot_msdyn.core.serialise import to_device
-from lerobot_msdyn.reconstruction.evidence import Evidence, in_front
+from lerobot_msdyn.reconstruction.evidence import Evidence, still_frames
 from lerobot_msdyn.scene.rendering import Rendering
 
 HOLE_ALPHA = 0.5  # below this opacity there is a hole: nothing is known to be there
@@ -56,7 +56,7 @@ def coverage_of(
         recorded = evidence.camera.select(slice(nearest, nearest + 1))
         in_camera = unproject_image(depth, camera.intrinsics[i]).reshape(-1, 3)
         points = transform_points(camera.world_from_camera[i], in_camera)
-        frames_background = in_front(points, recorded, evidence.depth, evidence.frames).reshape(depth.shape)
+        frames_background = still_frames(evidence, points).reshape(depth.shape)
         moving = rendering.moving[i] > 0.5 * alpha
         frames_moving = (rendering.extra[i] / rendering.moving[i].clamp(min=1e-6)).round().long()
         empty = alpha < HOLE_ALPHA

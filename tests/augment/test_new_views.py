@@ -91,7 +91,10 @@ def test_cameras_that_move_with_the_robot_are_refused(
         assert run(*source, "--cameras", f"[{camera}]") == 2
         (error,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
         assert reason in error
-        assert "--allow_moving" in error
+        assert ("--allow_moving" in error) == (camera == "front")
+    source = ["--repo", "local/desk", "--root", str(image_desk), "--new_root", str(tmp_path / "new")]
+    assert run(*source, "--cameras", "[wrist]", "--allow_moving", "true") == 2
+    assert "to which the recorded actions do not belong" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
 

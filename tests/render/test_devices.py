@@ -20,6 +20,7 @@ from lerobot_msdyn.priors.camera.stands import Stand, Stands
 from lerobot_msdyn.reconstruction.background import EmptyScene, background_gaussians
 from lerobot_msdyn.reconstruction.evidence import evidence_of
 from lerobot_msdyn.reconstruction.fit import FitResult, fit
+from lerobot_msdyn.reconstruction.key_views import fixed_view
 from lerobot_msdyn.reconstruction.make_overlay import unexplained
 from lerobot_msdyn.reconstruction.result import FittedWindow, Reconstruction
 from lerobot_msdyn.reconstruction.self_check import self_check
@@ -102,7 +103,7 @@ def test_what_is_made_of_a_fit(gpu: FakeGpu) -> None:
     empty = EmptyScene(view.rgb[0], priors.depth[0], torch.full((HEIGHT, WIDTH), FRAMES))
     with gpu:
         result = fitted(view, priors)
-        seen = evidence_of(result.scene, view.camera, empty)
+        seen = evidence_of(result.scene, view.camera, fixed_view(empty, view.camera))
         check = self_check(result.scene, view, priors, result.held_out)
         overlay = unexplained(result.scene, view, priors)
         result = replace(result, scene=replace(result.scene, overlay=overlay))

@@ -9,6 +9,7 @@ from lerobot_msdyn.core.geometry import se3
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.reconstruction.background import EmptyScene, background_gaussians
 from lerobot_msdyn.reconstruction.evidence import Evidence, evidence_of
+from lerobot_msdyn.reconstruction.key_views import fixed_view
 from lerobot_msdyn.reconstruction.reconstruct import reconstruct
 from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.rendering import render_scene
@@ -32,7 +33,7 @@ def wall() -> tuple[DynamicScene, Evidence, CameraTrack]:
     empty = EmptyScene(torch.full((HEIGHT, WIDTH, 3), 128, dtype=torch.uint8), depth, seen)
     static = background_gaussians(empty.rgb, depth, camera, 100_000)
     scene = DynamicScene(static, static.select(slice(0)), (), (), (), 3)
-    return scene, evidence_of(scene, camera, empty), camera
+    return scene, evidence_of(scene, camera, fixed_view(empty, camera)), camera
 
 
 def covered(offset: torch.Tensor) -> Coverage:

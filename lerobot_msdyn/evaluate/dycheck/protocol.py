@@ -17,6 +17,7 @@ from numpy import ndarray
 from lerobot_msdyn.evaluate.config import DycheckConfig
 from lerobot_msdyn.evaluate.dycheck.iphone import IphoneSequence, read_sequence
 from lerobot_msdyn.evaluate.dycheck.iphone_priors import read_priors
+from lerobot_msdyn.evaluate.dycheck.same_world import in_world_of
 from lerobot_msdyn.evaluate.metrics import masked_psnr_db, partial_ssim
 from lerobot_msdyn.evaluate.perceptual import SpatialNetwork, lpips_network, masked_lpips, without_lpips
 from lerobot_msdyn.evaluate.scores import Evaluated, Scores, mean_scores, score_table
@@ -83,11 +84,12 @@ def render_validation(
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
     rendered = {}
+    track = in_world_of(scene.camera, sequence.view.camera, sequence.cameras)
     cameras = np.array([name.split("_")[0] for name in sequence.validation])
     for camera in dict.fromkeys(cameras.tolist()):  # each stands still
         mine = np.flatnonzero(cameras == camera)
         frames = torch.tensor([sequence.frames[i] for i in mine])
-        pictures = new_pictures(scene, sequence.cameras.select(mine.tolist()), frames)
+        pictures = new_pictures(scene, track.select(mine.tolist()), frames)
         for i, picture in zip(mine.tolist(), pictures, strict=True):
             rendered[sequence.validation[i]] = picture.rgb
             if out is not None:

@@ -21,6 +21,7 @@ from lerobot_msdyn.priors.camera.steadiness import FIXED_PX, camera_motion_px
 from lerobot_msdyn.priors.hub import demand_library
 from lerobot_msdyn.priors.registry import Unusable
 
+SFM = "sfm"  # the name of the provider, and of the origin of its cameras
 _MAX_FRAMES = 100  # that are registered; the others are interpolated
 _OVERLAP = 10  # neighbours of a frame with which it is matched
 _MIN_SHARE = 0.5  # of the registered frames
@@ -29,7 +30,8 @@ _MIN_SHARE = 0.5  # of the registered frames
 def camera_from_sfm(view: View, instances: UInt8[Tensor, "t h w"]) -> CameraTrack:
     """The camera at every frame; the first one's frame is the world's, and the unit of length is arbitrary.
 
-    The focal length is that of `view.camera`, refined. Frames between registered ones are interpolated.
+    The focal length is that of `view.camera`, refined where it is only assumed. Frames between
+    registered ones are interpolated.
 
     Raises:
         PriorError: pycolmap is absent, the camera does not move, or too few frames could be registered.
@@ -57,7 +59,7 @@ def camera_from_sfm(view: View, instances: UInt8[Tensor, "t h w"]) -> CameraTrac
         view.camera,
         intrinsics=torch.from_numpy(intrinsics).float().expand(len(view.rgb), 3, 3).contiguous(),
         world_from_camera=world_from_camera,
-        origin="sfm",
+        origin=SFM,
     )
 
 
@@ -78,6 +80,7 @@ def _reconstruct(
     """World-from-camera of the registered frames of the largest model, and the refined intrinsics."""
     import pycolmap
 
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
     k = camera.intrinsics[0]
     parameters = ",".join(str(float(value)) for value in (k[0, 0], k[1, 1], k[0, 2], k[1, 2]))
     database = folder / "database.db"
@@ -86,6 +89,7 @@ def _reconstruct(
     matching, verification = pycolmap.FeatureMatchingOptions(num_threads=1), pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed, verification.ransac.num_threads = 0, 1
     mapping = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=0)
+    mapping.ba_refine_focal_length = camera.origin == "assumed"
     pycolmap.extract_features(
         database,
         folder / "images",

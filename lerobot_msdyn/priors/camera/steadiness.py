@@ -6,14 +6,12 @@ from jaxtyping import Bool, Float32, UInt8
 from numpy import ndarray
 from torch import Tensor
 
+from lerobot_msdyn.core.corners import FEWEST, away_from, corners_followed
 from lerobot_msdyn.core.sampling import evenly
 
 FIXED_PX = 0.5  # of 320: a camera whose picture moves less is fixed
 SWAY_PX = 3.0  # of 320: up to this it is taken as fixed; the masks allow for such a sway
 _PAIRS = 20  # pairs of frames that are looked at, evenly spread
-_CORNERS = 300
-_MIN_CORNERS = 12
-_RETURN_PX = 0.5  # difference of a corner to itself, followed there and back
 
 
 def camera_motion_px(rgb: UInt8[Tensor, "t h w 3"], moving: Bool[Tensor, "t h w"] | None = None) -> float:
@@ -32,20 +30,13 @@ def _usable(moving: Bool[Tensor, "t h w"] | None, frame: int, shape: tuple[int, 
     """255 where corners may be taken: what moves, and a band around it, is left out."""
     if moving is None:
         return np.full(shape, 255, np.uint8)
-    grown = cv2.dilate(moving[frame].numpy().astype(np.uint8), np.ones((9, 9), np.uint8))
-    return np.where(grown > 0, 0, 255).astype(np.uint8)
+    return away_from(moving[frame].numpy())
 
 
 def _motion_px(a: UInt8[ndarray, "h w"], b: UInt8[ndarray, "h w"], usable: UInt8[ndarray, "h w"]) -> float:
-    corners = cv2.goodFeaturesToTrack(a, _CORNERS, 0.01, 7, mask=usable)
-    if corners is not None and len(corners) >= _MIN_CORNERS:
-        there, followed, _ = cv2.calcOpticalFlowPyrLK(a, b, corners, None, winSize=(21, 21), maxLevel=4)
-        back, returned, _ = cv2.calcOpticalFlowPyrLK(b, a, there, None, winSize=(21, 21), maxLevel=4)
-        good = (
-            (followed[:, 0] > 0) & (returned[:, 0] > 0) & (np.linalg.norm(back - corners, axis=-1)[:, 0] < _RETURN_PX)
-        )
-        if good.sum() >= _MIN_CORNERS:
-            return float(np.median(np.linalg.norm((there - corners)[good, 0], axis=-1)))
+    corners, there = corners_followed(a, b, usable)
+    if len(corners) >= FEWEST:
+        return float(np.median(np.linalg.norm(there - corners, axis=-1)))
     pair: list[Float32[ndarray, "h w"]] = [np.where(usable > 0, image, 0).astype(np.float32) for image in (a, b)]
     window = cv2.createHanningWindow(a.shape[::-1], cv2.CV_32F)
     shift, _ = cv2.phaseCorrelate(pair[0], pair[1], window)

@@ -18,11 +18,13 @@ from concurrent.futures import ThreadPoolExecutor
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 from numpy import ndarray
 from torch import Tensor
 
+from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.images import box_about
+from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.priors.camera.steadiness import SWAY_PX, camera_motion_px
 from lerobot_msdyn.priors.masks.change import Colours, Reference, along_edges, changes, to_lab
@@ -30,7 +32,7 @@ from lerobot_msdyn.priors.masks.ghosts import median_where, without_ghosts
 from lerobot_msdyn.priors.masks.linking import numbered
 from lerobot_msdyn.priors.masks.stabilise import camera_sway, to_frames, to_reference
 from lerobot_msdyn.priors.masks.votes import AUDIBLE, votes
-from lerobot_msdyn.priors.masks.wandering import residual_odds
+from lerobot_msdyn.priors.masks.wandering import odds_before, residual_odds
 
 _MAX_WIDTH = 320  # px
 _MEDIAN_SAMPLES = 60  # frames over which medians are taken
@@ -99,6 +101,18 @@ def moving_instances(
     if sway is not None:
         numbers = to_frames(numbers, sway[: len(frames)])
     return torch.from_numpy(_at_size(numbers, (width, height)))
+
+
+def instances_before(
+    rgb: UInt8[Tensor, "t h w 3"], depth: Float[Tensor, "t h w"], camera: CameraTrack
+) -> UInt8[Tensor, "t h w"]:
+    """As `moving_instances`, before a camera that moves and whose poses are known, with depth (m, 0 = unknown)."""
+    height, width = rgb.shape[1:3]
+    small = View(rgb, camera, depth).shrunk(_MAX_WIDTH)
+    assert small.depth is not None
+    frames = small.rgb.numpy()
+    moving = np.stack([_tidy(odds > 0) for odds in odds_before(frames, small.depth, small.camera)])
+    return torch.from_numpy(_at_size(numbered(frames, moving), (width, height)))
 
 
 def _at_size(numbers: UInt8[ndarray, "t h w"], size: tuple[int, int]) -> UInt8[ndarray, "t H W"]:

@@ -4,17 +4,24 @@ import itertools
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float, Float32, Float64, UInt8
 from numpy import ndarray
+from torch import Tensor
 
+from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.images import masked_median
+from lerobot_msdyn.core.sampling import evenly
+from lerobot_msdyn.priors.fused_frames import Source, fused, tolerance_of, usual_difference
 from lerobot_msdyn.priors.masks.change import Reference, along_edges
 
 _OFFSETS = (-12, -8, -4, 4, 8, 12)  # frames that are laid over a frame; together they show its background
 _MIN_SEEN = 3  # of them, without which a pixel is not judged
+_COMPARED = 12  # frames by which the tolerance of depth is found
 _CORNERS = 600
 _MIN_CORNERS = 12  # that must agree on a homography
 _AGREE_PX = 1.5
+_ELSEWHERE = 8  # frames of all of the clip that show it as well, where poses and depth are known
+_NEARER, _BY_DEPTH = 2.0, 2.0  # times the tolerance of depth, before the background: so many log-odds for moving
 _NOISE_FLOOR = 2.0  # CIE Lab units: warped pictures are a little blurred
 
 
@@ -38,6 +45,32 @@ def residual_odds(frames: UInt8[ndarray, "t h w 3"]) -> Float32[ndarray, "t h w"
         known = seen.sum(0) >= _MIN_SEEN
         odds = Reference(background, np.full(known.shape, _NOISE_FLOOR, np.float32)).change(frames[t])
         out[t] = np.where(known, along_edges(odds, frames[t]), 0)
+    return out
+
+
+def odds_before(
+    frames: UInt8[ndarray, "t h w 3"], depth: Float[Tensor, "t h w"], camera: CameraTrack
+) -> Float32[ndarray, "t h w"]:
+    """The same for a camera whose poses are known, with depth (m, 0 = unknown): without a rim of parallax.
+
+    The background of a frame is what others show at its place, fused through the poses (`fused_frames`); what is
+    clearly before it counts as moving, too.
+    """
+    sources = [Source.of(frame, depth[t], camera.select([t])) for t, frame in enumerate(frames)]
+    difference = usual_difference([sources[t] for t in evenly(len(sources), _COMPARED).tolist()])
+    tolerance, everywhere = tolerance_of(difference), evenly(len(frames), _ELSEWHERE).tolist()
+    out = np.zeros(frames.shape[:3], np.float32)
+    for t, source in enumerate(sources):
+        near = {t + offset for offset in _OFFSETS if 0 <= t + offset < len(frames)}
+        others = [sources[s] for s in sorted({*near, *everywhere} - {t})]
+        if len(others) < _MIN_SEEN:
+            continue
+        background = fused(source, others, tolerance, exact=False)
+        known = (background.seen >= _MIN_SEEN).numpy()
+        noise = np.full(known.shape, _NOISE_FLOOR, np.float32)
+        odds = Reference(np.where(known[..., None], background.rgb.numpy(), frames[t]), noise).change(frames[t])
+        before = (source.depth > 0) & (source.depth < (1 - _NEARER * tolerance) * background.depth)
+        out[t] = np.where(known, along_edges(odds + np.float32(_BY_DEPTH) * before.numpy(), frames[t]), 0)
     return out
 
 

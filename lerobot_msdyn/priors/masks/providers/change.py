@@ -8,8 +8,10 @@ from lerobot_msdyn.priors.masks.moving import moving_instances, temporal_median
 from lerobot_msdyn.priors.registry import MASKS, Estimate, MaskProvider, Masks
 from lerobot_msdyn.priors.request import Request
 
+CHANGE = "change"  # the name of the provider
 
-@MASKS.register("change")
+
+@MASKS.register(CHANGE)
 class Change(MaskProvider):
     """Can always be used."""
 
