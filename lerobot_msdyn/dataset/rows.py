@@ -86,7 +86,8 @@ def _layout(path: Path, changed_ns: int, size: int) -> tuple[pq.FileMetaData, li
     It is read once: a file that LeRobot records has a row group per episode, thousands of them.
     """
     metadata = pq.read_metadata(path)
-    column = metadata.schema.to_arrow_schema().get_field_index("episode_index")
+    leaves = [metadata.schema.column(number).path for number in range(len(metadata.schema))]  # pictures have two
+    column = leaves.index("episode_index") if "episode_index" in leaves else -1
     spans: list[tuple[int, int] | None] = []
     for number in range(metadata.num_row_groups):
         about = metadata.row_group(number).column(column).statistics if column >= 0 else None
