@@ -4,7 +4,11 @@ from dataclasses import dataclass
 
 from .cameras import CAMERAS
 
-FEW = ("recorded", "azimuth -10", "azimuth +10", "azimuth -15", "azimuth +15")
+FEW = (
+    "recorded",
+    *(f"azimuth {sign}{size}" for size in (10, 15) for sign in "-+"),
+    *(f"{side} 5 cm" for side in ("left", "right", "up", "down")),
+)
 
 
 @dataclass(frozen=True)

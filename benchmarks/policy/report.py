@@ -11,18 +11,22 @@ from .cameras import CAMERAS
 from .forms import Form
 from .score import BASE, BEST, Outcomes, share, success
 
+MOVED = "all moved"  # the group of all cameras but the recorded one
 WIDTH_PX, HEIGHT_PX, LEFT_PX, TOP_PX, KEY_PX = 860, 330, 40, 16, 200
 COLOURS = ("#888888", "#c8641b", "#1f7a3d", "#8a3fa0", "#1f5fa8", "#b02a4a", "#9a8a10", "#3aa0a0")
 
 
 def outcomes(folder: Path, rows: Sequence[str], form: Form) -> Mapping[str, Outcomes]:
-    """Group of cameras -> row -> solved [seeds, cameras, tasks]; seeds and groups that are finished only.
+    """Group of cameras -> row -> solved [seeds, cameras, tasks]; seeds and groups that are finished only; MOVED last.
 
     `folder` is that of one policy; it holds <row>/<seed>/<camera>.json.
     """
     groups: dict[str, dict[str, np.ndarray]] = {}
-    for group in dict.fromkeys(CAMERAS[name].group for name in form.cameras):
-        names = [name for name in form.cameras if CAMERAS[name].group == group]
+    members: dict[str, list[str]] = {}
+    for name in form.cameras:
+        members.setdefault(CAMERAS[name].group, []).append(name)
+    members[MOVED] = [name for name in form.cameras if name != "recorded"]
+    for group, names in members.items():
         for row in rows:
             files = [[folder / row / str(seed) / f"{name}.json" for name in names] for seed in range(form.seeds)]
             solved = [[json.loads(path.read_text()) for path in of] for of in files if all(p.exists() for p in of)]

@@ -180,7 +180,7 @@ def test_the_report_has_the_finished_cells(tmp_path: Path) -> None:
     (tmp_path / "product" / "1" / "azimuth -10.json").write_text("[true, true, true, true]")
     groups = report.outcomes(tmp_path, list(rates), form)
     text = report.table(groups)
-    assert "| trained on | recorded | azimuth 10 | seeds |" in text
+    assert "| trained on | recorded | azimuth 10 | all moved | seeds |" in text
     assert "| product | 1.00 | 0.50; 0.50 (" in text
     assert "| oracle | 1.00 | 1.00 | 1 |" in text
     ElementTree.fromstring(report.plot(groups))
