@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from .cameras import Placement, intrinsics, product_pose, random_placement, table_homography
+from .cameras import DISTANCE_M, Placement, intrinsics, product_pose, random_placement, table_homography
 from .forms import Form
 from .store import Store
 
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
 RECORDED = "recorded"
 WITHOUT_JOINTS = "--camera.by_robot=false"
+WITH_JOINTS = ("--robot.name=so101",)
 Episode = tuple["Demonstration", Iterable[np.ndarray]]  # and the front pictures [h, w, 3] of its frames
 
 
@@ -180,11 +181,17 @@ def front_pictures(dataset: "LeRobotDataset", episode: int) -> list[np.ndarray]:
     return list(decoded.permute(0, 2, 3, 1).numpy())
 
 
-def product(sets: Sets, path: Path, flags: tuple[str, ...] = (WITHOUT_JOINTS,)) -> None:
-    """What the package's command makes of the recording, with its defaults but for the given flags."""
+def product(sets: Sets, path: Path, flags: tuple[str, ...] = (WITHOUT_JOINTS,), *, wide: bool = False) -> None:
+    """What the package's command makes of the recording, with its defaults but for the given flags.
+
+    `wide`: from poses of the oracle's range.
+    """
     source = sets.folder(ROWS[RECORDED])
     given = [f"--root={source}", f"--new_root={path}", "--new_repo_id=local/policy_msdyn", "--repo=local/policy"]
     given += [f"--variants={sets.form.variants}", f"--workers={sets.workers}"]
+    if wide:
+        given += [f"--perturbation.azimuth_deg={sets.form.range_deg}", f"--perturbation.translation_m={sets.form.range_m}"]
+        given += [f"--perturbation.translation_rel={sets.form.range_m / DISTANCE_M:.2f}"]
     command = [sys.executable, "-m", "lerobot_msdyn.augment", *given]
     environment = os.environ | {"LEROBOT_MSDYN_CACHE": str(sets.store.root / "priors"), "HF_HUB_OFFLINE": "1"}
     log = sets.store.root / "augment.log"
@@ -228,7 +235,10 @@ ROWS: dict[str, Row] = {
     "oracle": Row("oracle", oracle),
     "homography": Row("homography", homography),
     "product": Row("product", product),
-    "product with joints": Row("product_joints", partial(product, flags=("--robot.name=so101",))),
+    "product with joints": Row("product_joints", partial(product, flags=WITH_JOINTS)),
+    "product with joints, the oracle's range": Row(
+        "product_joints_wide", partial(product, flags=WITH_JOINTS, wide=True)
+    ),
     "oracle at the product's poses": Row("oracle_product", partial(oracle_at_poses_of, "product")),
 }
 
@@ -245,7 +255,8 @@ def _swept(name: str, field: str, values: Iterable[Any]) -> dict[str, Row]:
 
 _many = partial(product, flags=(WITHOUT_JOINTS, "--variants=10"))  # the first n of more variants are those of n
 SWEEPS: dict[str, dict[str, Row]] = {
-    "range": _swept("range", "perturbation.azimuth_deg", (5, 10, 15, 20, 30)),
+    "range": _swept("range", "perturbation.azimuth_deg", (5, 10, 15, 20, 30))
+    | {"product, the oracle's range": Row("product_wide", partial(product, wide=True))},
     "sampling": {
         "one pose per episode": ROWS["product"],
         "oracle, one pose per frame": Row("oracle_per_frame", oracle_per_frame),

@@ -19,7 +19,7 @@ class Orbit(Perturbation):
     # Largest turn up or down, about the horizontal, in degrees.
     elevation_deg: float = between(5.0, 0, 60)
     # Largest shift along each of the camera's axes in metres, where the scale is metric.
-    translation_m: float = between(0.02, 0, 10)
+    translation_m: float = between(0.05, 0, 10)
     # The same as a fraction of the distance to the look-at point, where it is not.
     translation_rel: float = between(0.03, 0, 0.9)
 
