@@ -190,8 +190,11 @@ def product(sets: Sets, path: Path, flags: tuple[str, ...] = (WITHOUT_JOINTS,), 
     given = [f"--root={source}", f"--new_root={path}", "--new_repo_id=local/policy_msdyn", "--repo=local/policy"]
     given += [f"--variants={sets.form.variants}", f"--workers={sets.workers}"]
     if wide:
-        given += [f"--perturbation.azimuth_deg={sets.form.range_deg}", f"--perturbation.translation_m={sets.form.range_m}"]
-        given += [f"--perturbation.translation_rel={sets.form.range_m / DISTANCE_M:.2f}"]
+        given += [
+            f"--perturbation.azimuth_deg={sets.form.range_deg}",
+            f"--perturbation.translation_m={sets.form.range_m}",
+            f"--perturbation.translation_rel={sets.form.range_m / DISTANCE_M:.2f}",
+        ]
     command = [sys.executable, "-m", "lerobot_msdyn.augment", *given]
     environment = os.environ | {"LEROBOT_MSDYN_CACHE": str(sets.store.root / "priors"), "HF_HUB_OFFLINE": "1"}
     log = sets.store.root / "augment.log"
