@@ -25,7 +25,7 @@ from lerobot_msdyn.augment.episode import augment_episode
 from lerobot_msdyn.augment.failures import same_reason
 from lerobot_msdyn.augment.robot_cameras import calibrated
 from lerobot_msdyn.augment.run_identity import source_folder
-from lerobot_msdyn.augment.workers import Work, Workers, threads_of_one, workers_for
+from lerobot_msdyn.augment.workers import Work, Workers, terse, threads_of_one, workers_for
 from lerobot_msdyn.core.errors import EpisodeError, MsdynError
 from lerobot_msdyn.dataset.convert import named_as_given
 from lerobot_msdyn.dataset.provenance import CALIBRATION
@@ -178,7 +178,7 @@ def plan(source: LeRobotDatasetMetadata, episodes: list[int], cameras: list[str]
     copies = variants + int(config.include_source)
     disk = predicted_output_bytes(source, episodes, config)
     count = workers_for(config, frames, len(episodes))
-    with threads_of_one(count):
+    with threads_of_one(count), terse(config):
         speeds = first_speeds(source, episodes, cameras, config)
     seconds = predicted_seconds(speeds, source, episodes, config, count)
     scenes = predicted_scene_bytes(speeds, source, episodes, config) if config.save_scenes else 0.0

@@ -14,7 +14,7 @@ from lerobot_msdyn.augment.cost import (
     predicted_output_bytes,
 )
 from lerobot_msdyn.augment.job import Opened, place_of
-from lerobot_msdyn.augment.workers import cores, most_workers, threads_of_one
+from lerobot_msdyn.augment.workers import cores, most_workers, terse, threads_of_one
 from lerobot_msdyn.cluster.config import ClusterConfig, job_settings
 from lerobot_msdyn.cluster.shards import shards
 from lerobot_msdyn.cluster.stages import finished_in
@@ -74,7 +74,7 @@ def unfinished_ranks(job: Job) -> list[int]:
 def cost_table(opened: Opened, config: AugmentConfig, job: Job) -> str:
     """Episodes, frames, minutes and disk of each task, judging by a little of the work on this machine."""
     source = opened.source
-    with threads_of_one(max(1, job.processes)):
+    with threads_of_one(max(1, job.processes)), terse(config):
         speeds = first_speeds(source, opened.episodes, opened.cameras, config)
     background_s = predicted_background_seconds(speeds, source, opened.episodes, config, job.processes)
     frames = [int(source.episodes[index]["length"]) for index in opened.episodes]
