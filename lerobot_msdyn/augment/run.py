@@ -35,6 +35,7 @@ from lerobot_msdyn.render.devices import chosen_device
 
 logger = logging.getLogger(__name__)
 
+FORESEEN = 0.05  # share of the work after which what is left can be told
 UNWATCHED_S = 30.0  # between updates of a progress bar that nobody watches
 
 
@@ -75,15 +76,18 @@ def run_local(
     config, problems = prepared(source, episodes, cameras, config, output)
     failures: dict[int, str] = {}
     reasons: set[str] = set()
-    bar_format = "{desc} |{bar}| {percentage:3.0f} % of {total} episodes [{elapsed}<{remaining}]"
+    bar_format = "{desc} |{bar}| {percentage:3.0f} % of {total} episodes [{elapsed}"
     watched = sys.stderr.isatty()  # in a file a bar has a line per update
     interval_s = 0.1 if watched else UNWATCHED_S
-    with logging_redirect_tqdm(), tqdm(total=len(episodes), bar_format=bar_format, mininterval=interval_s) as bar:
+    plain = functools.partial(tqdm, bar_format=f"{bar_format}]", mininterval=interval_s, smoothing=0)
+    with logging_redirect_tqdm(), plain(total=len(episodes)) as bar:
 
         def progress(what: str, share: float) -> None:
             if what:
                 bar.set_description_str(what, refresh=watched)
             bar.update(min(share, len(episodes) - bar.n))  # shares add up to one only up to rounding
+            if bar.n >= FORESEEN * len(episodes):
+                bar.bar_format = f"{bar_format}<{{remaining}}]"
 
         bar.set_description_str("looking at the background", refresh=watched)
         work = Work(source, cameras, config, output, progress)
