@@ -182,7 +182,7 @@ def test_the_report_has_the_finished_cells(tmp_path: Path) -> None:
     text = report.table(groups)
     assert "| trained on | recorded | azimuth 10 | all moved | seeds |" in text
     assert "| product | 1.00 | 0.50; 0.50 (" in text
-    assert "| oracle | 1.00 | 1.00 | 1 |" in text
+    assert "| oracle | 1.00 | 1.00 | 1.00 | 1 |" in text
     ElementTree.fromstring(report.plot(groups))
 
 
