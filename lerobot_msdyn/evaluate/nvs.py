@@ -17,7 +17,7 @@ from jaxtyping import Int, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from lerobot_msdyn.augment.robot_cameras import calibrated
+from lerobot_msdyn.augment.robot_cameras import NAME, calibrated
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.errors import DatasetError
 from lerobot_msdyn.core.observations import View
@@ -124,6 +124,7 @@ def read_view(config: EvaluateConfig) -> View:
     train = _arrays(folder / "gt" / "train.npz", ("K", "c2w"))
     source = open_source(f"local/{folder.name}", folder / ("dataset_depth" if recorded else "dataset"))
     key = select_cameras(source, config.cameras)[0]
+    (config.out / ROBOT / NAME).unlink(missing_ok=True)  # it may be another scene's
     found = calibrated(source, [0], [key], config, config.out / ROBOT)
     view = read_episode(source, 0, [key], found.camera, recorded_depth=recorded).views[key]
     height, width = view.rgb.shape[1:3]

@@ -16,10 +16,9 @@ from torch import Tensor
 from lerobot_msdyn.core.compiled import compiled, inlined
 from lerobot_msdyn.core.geometry import quaternion_conjugate, quaternion_multiply, quaternion_to_matrix
 from lerobot_msdyn.render.cpu.simd import take_ticket
-from lerobot_msdyn.render.cpu.threads import run
+from lerobot_msdyn.render.cpu.threads import POINTS_PER_TICKET, point_tickets, run
 from lerobot_msdyn.scene.gaussians import SH_C0, SH_C1, shaded
 
-_BLOCK = 4096  # points
 TINY = 1e-24  # squared length of an orientation, below which it is none
 
 
@@ -54,7 +53,7 @@ class _Seen(torch.autograd.Function):
     def forward(ctx: Any, *given: Tensor) -> Tensor:
         inputs = [each.detach().contiguous() for each in given]
         colours = torch.empty_like(inputs[3])
-        run(_forward, _tickets(colours), *(each.numpy() for each in inputs), colours.numpy())
+        run(_forward, point_tickets(*colours.shape[:2]), *(each.numpy() for each in inputs), colours.numpy())
         ctx.save_for_backward(*inputs, colours)
         return colours
 
@@ -67,13 +66,8 @@ class _Seen(torch.autograd.Function):
         to_quats, to_means = torch.empty_like(quats), torch.empty_like(means)
         results = (to_sh, to_canonical, to_quats, to_means)
         arrays = (*inputs, colours, gradients[0].contiguous(), *results)
-        run(_backward, _tickets(means), *(each.numpy() for each in arrays))
+        run(_backward, point_tickets(*means.shape[:2]), *(each.numpy() for each in arrays))
         return to_sh.sum(0), to_canonical.sum(0), to_quats, to_means, None
-
-
-def _tickets(points: Tensor) -> int:
-    """Blocks of points, of all times of the batch."""
-    return len(points) * -(-points.shape[1] // _BLOCK)
 
 
 @inlined
@@ -109,11 +103,11 @@ def _forward(
 ) -> None:
     """Of the blocks that this thread draws."""
     batch, count = means.shape[:2]
-    blocks = -(-count // _BLOCK)
+    blocks = -(-count // POINTS_PER_TICKET)
     ticket = take_ticket(tickets)
     while ticket < batch * blocks:
         time, block = ticket // blocks, ticket % blocks
-        for point in range(block * _BLOCK, min(count, (block + 1) * _BLOCK)):
+        for point in range(block * POINTS_PER_TICKET, min(count, (block + 1) * POINTS_PER_TICKET)):
             x, y, z, _ = _sight(means, eye, time, point)
             w, i, j, k = quats[time, point]
             x, y, z = _turned(w, -i, -j, -k, x, y, z)
@@ -146,11 +140,11 @@ def _backward(
     2 (0, g) q / |q|^2 of q.
     """
     batch, count = means.shape[:2]
-    blocks = -(-count // _BLOCK)
+    blocks = -(-count // POINTS_PER_TICKET)
     ticket = take_ticket(tickets)
     while ticket < batch * blocks:
         time, block = ticket // blocks, ticket % blocks
-        for point in range(block * _BLOCK, min(count, (block + 1) * _BLOCK)):
+        for point in range(block * POINTS_PER_TICKET, min(count, (block + 1) * POINTS_PER_TICKET)):
             s0, s1, s2, length = _sight(means, eye, time, point)
             qw, qx, qy, qz = quats[time, point]
             cw, cx, cy, cz = canonical[point]

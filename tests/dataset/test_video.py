@@ -114,3 +114,15 @@ def test_without_a_gpu_nvenc_is_not_used(caplog: pytest.LogCaptureFixture) -> No
         assert nvenc_of(given) is given
         assert nvenc_of(given) is given
     assert [record.getMessage()[:30] for record in caplog.records] == ["h264_nvenc cannot be used here"]
+
+
+@pytest.mark.parametrize("params", ["", "lossless=1", "lossless=1:log-level=info"])
+def test_x265_writes_nothing_that_was_not_asked_for(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], params: str
+) -> None:
+    encoder = DepthEncoderConfig(vcodec="hevc", extra_options={"x265-params": params} if params else {})
+    depth = np.full((3, 48, 64), 0.5, np.float32)
+    with VideoFile(tmp_path / "depth.mp4", FPS, encoder) as file:
+        for picture in depth:
+            file.add(picture)
+    assert ("x265 [info]" in capfd.readouterr().err) == ("info" in params)

@@ -21,6 +21,8 @@ from lerobot_msdyn.core.errors import ConfigError, DatasetError, EpisodeError, P
 from lerobot_msdyn.dataset.calibration import read_calibration
 from lerobot_msdyn.dataset.provenance import CALIBRATION, FOLDER, TABLE
 from lerobot_msdyn.dataset.read import open_source, read_episode
+from lerobot_msdyn.evaluate import nvs
+from lerobot_msdyn.evaluate.config import EvaluateConfig
 from lerobot_msdyn.priors import estimate_priors
 from lerobot_msdyn.robots import Robot, map_joints
 from lerobot_msdyn.robots.calibration.refine import Solution
@@ -225,3 +227,36 @@ def test_a_calibration_of_another_robot_is_named(
     config = CameraConfig(calibration=record(urdf, tmp_path / "c.json", **changes))
     with pytest.raises(PriorError, match=expected):
         read_episode(open_source("local/arm", recorded), 0, [FRONT], config)
+
+
+def test_held_out_views_are_drawn_with_what_the_joints_tell(
+    arm: Robot, recorded: Path, urdf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`evaluate nvs` looks for the robot, and puts its links before the true camera, at the same pixels."""
+    folder, out = tmp_path / "scene", tmp_path / "out"
+    (folder / "gt").mkdir(parents=True)
+    (folder / "dataset").symlink_to(recorded)
+    focal = 1.1 * POSE.focal * WIDTH
+    K = np.array([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
+    frames = 24
+    np.savez(folder / "gt" / "train.npz", K=K, c2w=np.eye(4)[None].repeat(frames, 0))
+    stale = out / nvs.ROBOT / NAME
+    stale.parent.mkdir(parents=True)
+    stale.write_text("of another scene")
+
+    def found(source: Any, episodes: Any, cameras: Any, config: EvaluateConfig, place: Path) -> EvaluateConfig:
+        assert (episodes, cameras, place, stale.exists()) == ([0], [FRONT], stale.parent, False)
+        config.camera.calibration = record(urdf, tmp_path / "c.json")
+        return config
+
+    monkeypatch.setattr(nvs, "calibrated", found)
+    view = nvs.read_view(EvaluateConfig(scene_folder=folder, out=out, depth="none"))
+    config = CameraConfig(calibration=tmp_path / "c.json")
+    told = read_episode(open_source("local/arm", recorded), 0, [FRONT], config).views[FRONT].robot
+    assert view.robot is not None
+    assert told is not None
+    torch.testing.assert_close(view.robot.depth, 1.1 * told.depth)
+    seen = view.robot.bodies.xyz[view.robot.bodies.visible]
+    column, row = (seen[:, axis] / seen[:, 2] * focal + size / 2 for axis, size in ((0, WIDTH), (1, HEIGHT)))
+    assert bool(((column >= 0) & (column < WIDTH) & (row >= 0) & (row < HEIGHT)).all())
+    assert torch.equal(view.robot.moving, told.moving)

@@ -16,10 +16,9 @@ from torch import Tensor
 
 from lerobot_msdyn.core.compiled import compiled, inlined
 from lerobot_msdyn.render.cpu.simd import take_ticket
-from lerobot_msdyn.render.cpu.threads import run
+from lerobot_msdyn.render.cpu.threads import POINTS_PER_TICKET, point_tickets, run
 
 DEGENERATE = 1e-3  # area spanned by the first two columns of a blend, below which it has no direction left
-_BLOCK = 4096  # points
 
 
 def carried(
@@ -64,7 +63,7 @@ class _Carry(torch.autograd.Function):
         moved, turned = torch.empty_like(inputs[3]), torch.empty_like(inputs[4])
         arrays = [each.numpy() for each in inputs]
         arrays[0] = arrays[0].reshape(*affines.shape[:2], 12)
-        run(_forward, _tickets(positions), *arrays, moved.numpy(), turned.numpy())
+        run(_forward, point_tickets(*positions.shape[:2]), *arrays, moved.numpy(), turned.numpy())
         ctx.save_for_backward(*inputs)
         return moved, turned
 
@@ -72,7 +71,7 @@ class _Carry(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         affines, weights, indices, positions, quats = ctx.saved_tensors
         given = [each.contiguous().numpy() for each in gradients]
-        tickets = _tickets(positions)
+        tickets = point_tickets(*positions.shape[:2])
         to_affines = np.zeros((tickets, len(affines), 12), np.float32)
         to_weights = np.empty((len(positions), *weights.shape), np.float32)
         to_positions, to_quats = (np.empty(each.shape, np.float32) for each in (positions, quats))
@@ -95,11 +94,6 @@ class _Carry(torch.autograd.Function):
             torch.from_numpy(to_positions),
             torch.from_numpy(to_quats),
         )
-
-
-def _tickets(positions: Tensor) -> int:
-    """Blocks of points, of all times of the batch."""
-    return len(positions) * -(-positions.shape[1] // _BLOCK)
 
 
 @inlined
@@ -185,13 +179,13 @@ def _forward(
 ) -> None:
     """Of the blocks that this thread draws."""
     batch, count = positions.shape[:2]
-    blocks = -(-count // _BLOCK)
+    blocks = -(-count // POINTS_PER_TICKET)
     map_ = np.empty(12, np.float32)
     oriented = quats.shape[1] > 0
     ticket = take_ticket(tickets)
     while ticket < batch * blocks:
         time, block = ticket // blocks, ticket % blocks
-        for point in range(block * _BLOCK, min(count, (block + 1) * _BLOCK)):
+        for point in range(block * POINTS_PER_TICKET, min(count, (block + 1) * POINTS_PER_TICKET)):
             _blended(map_, affines, weights, indices, time, point)
             x, y, z = positions[time, point]
             for axis in range(3):
@@ -230,13 +224,13 @@ def _backward(
     r of b beside x: w = x (db.z - (x.b) da.z / |a|) / r - y da.z / |a| + z da.y / |a|.
     """
     batch, count = positions.shape[:2]
-    blocks = -(-count // _BLOCK)
+    blocks = -(-count // POINTS_PER_TICKET)
     map_, to_map = np.empty(12, np.float32), np.empty(12, np.float32)
     oriented = quats.shape[1] > 0
     ticket = take_ticket(tickets)
     while ticket < batch * blocks:
         time, block = ticket // blocks, ticket % blocks
-        for point in range(block * _BLOCK, min(count, (block + 1) * _BLOCK)):
+        for point in range(block * POINTS_PER_TICKET, min(count, (block + 1) * POINTS_PER_TICKET)):
             _blended(map_, affines, weights, indices, time, point)
             g0, g1, g2 = moved[time, point]
             x, y, z = positions[time, point]

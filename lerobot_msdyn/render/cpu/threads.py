@@ -18,6 +18,8 @@ from typing import Any
 import numpy as np
 import torch
 
+POINTS_PER_TICKET = 4096  # of a kernel that takes points: a fixed size, so that sums do not depend on the threads
+
 _threads: ContextVar[int | None] = ContextVar("threads", default=None)
 
 
@@ -62,3 +64,8 @@ def run(kernel: Callable[..., None], items: int, *arguments: Any) -> None:
     for future in futures:
         if not future.cancel():  # one that never started has nothing left to do
             future.result()
+
+
+def point_tickets(times: int, points: int) -> int:
+    """Blocks of `POINTS_PER_TICKET` points, of all times of a batch."""
+    return times * -(-points // POINTS_PER_TICKET)
