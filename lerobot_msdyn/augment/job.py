@@ -161,7 +161,7 @@ def deliver(
     if not new:
         first = [*skipped, *dropped][0]
         raise EpisodeError(f"no episode could be augmented; nothing was written. First: {first}")
-    accounts = accounts_of(entries_of(made)[0])
+    accounts = accounts_of(entry for entry, _ in entries_of(made))
     units = units_of_shifts([episode.provenance.perturbation for episode in made])
     rendered = sum(episode.provenance.variant != SOURCE_VARIANT for episode in new)
 

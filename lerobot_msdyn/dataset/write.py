@@ -36,6 +36,7 @@ from lerobot_msdyn.dataset.video_index import index_of
 from lerobot_msdyn.scene import store
 
 MEGABYTE = 1024**2
+METADATA_AT_ONCE = 200  # episodes: each group of them takes memory for its statistics until the file is closed
 
 
 @dataclass(frozen=True)
@@ -359,6 +360,7 @@ class _Assembly:
             chunks_size=source.chunks_size,
             data_files_size_in_mb=source.data_files_size_in_mb,
             video_files_size_in_mb=source.video_files_size_in_mb,
+            metadata_buffer_size=METADATA_AT_ONCE,
         )
         self.meta.info.features = copy.deepcopy(source.features)
         self.meta.info.tools = copy.deepcopy(source.info.tools)

@@ -5,7 +5,7 @@ each, and page.LISTED rows of text.
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from lerobot.datasets import LeRobotDatasetMetadata
 
-from lerobot_msdyn.augment.report.page import Pictures, ViewEntry, page
+from lerobot_msdyn.augment.report.page import LISTED, Pictures, ViewEntry, page
 from lerobot_msdyn.augment.report.pictures import (
     CLIP_FRAMES,
     STRIP_FRAMES,
@@ -55,11 +55,15 @@ def write_report(
         skipped_episodes: how many were.
         seconds: what the run took.
     """
-    entries, places = entries_of(episodes)
+    entries = [_without_details(entry) for entry, _ in entries_of(episodes)]
     output = open_source(source.repo_id, root)
-    for i in sorted(_pictured(entries)):
-        entry = entries[i]
-        entries[i] = replace(entry, pictures=_pictures(source, output, places[i], entry))
+    pictured = _pictured(entries)
+    dropped = set([i for i, entry in enumerate(entries) if entry.dropped][:LISTED])
+    for i, (entry, index) in enumerate(entries_of(episodes)):
+        if i in pictured and index is not None:
+            entries[i] = replace(entry, pictures=_pictures(source, output, index, entry))
+        elif i in dropped:
+            entries[i] = entry
     path = root / NAME
     figures, links = _figures(episodes, entries, skipped_episodes, seconds), _links(root)
     path.write_text(page(name, figures, entries, skipped, links), encoding="utf-8")
@@ -73,25 +77,26 @@ def _links(root: Path) -> dict[str, str]:
     return {name: data_url(picture[..., ::-1].copy()) for name, picture in pictures.items() if picture is not None}
 
 
-def entries_of(episodes: Sequence[NewEpisode]) -> tuple[list[ViewEntry], dict[int, int]]:
-    """All views, and for those that were kept the episode of the output."""
-    entries: list[ViewEntry] = []
-    places: dict[int, int] = {}
+def entries_of(episodes: Iterable[NewEpisode]) -> Iterator[tuple[ViewEntry, int | None]]:
+    """All views, each with its episode of the output if it was kept."""
     index = 0
     for episode in episodes:
         origin = episode.provenance
         if origin.variant != SOURCE_VARIANT:
             for camera, view in origin.gate["views"].items():
-                if not episode.dropped:
-                    places[len(entries)] = index
                 amounts, rejected = origin.perturbation[camera], origin.gate["rejected"]
                 view = view | origin.views[camera]
                 dropped = bool(episode.dropped)
-                entries.append(
-                    ViewEntry(episode.source_index, origin.variant, camera, amounts, view, rejected, dropped)
-                )
+                entry = ViewEntry(episode.source_index, origin.variant, camera, amounts, view, rejected, dropped)
+                yield entry, None if dropped else index
         index += not episode.dropped
-    return entries, places
+
+
+def _without_details(entry: ViewEntry) -> ViewEntry:
+    """Without what only views that are shown at length tell, most of its memory: there may be thousands."""
+    if entry.scores is None:
+        return entry
+    return replace(entry, view=entry.view | {"scores": entry.scores | {"heat": [], "frames": []}})
 
 
 def _pictured(entries: Sequence[ViewEntry]) -> set[int]:
