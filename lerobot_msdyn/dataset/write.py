@@ -36,6 +36,7 @@ from lerobot_msdyn.dataset.video_index import index_of
 from lerobot_msdyn.scene import store
 
 MEGABYTE = 1024**2
+ROWS_IN_GROUP = 100  # of a parquet file, at least: each group takes 6 kB of memory until the file is closed
 METADATA_AT_ONCE = 200  # episodes: each group of them takes memory for its statistics until the file is closed
 
 
@@ -305,36 +306,49 @@ class _Files:
 
 
 class _RowFiles:
-    """The growing series of parquet files, one row group per episode, as LeRobot writes them."""
+    """The growing series of parquet files: a row group per episode, as LeRobot writes them, or several short ones."""
 
     def __init__(self, meta: LeRobotDatasetMetadata, folder: Path) -> None:
         self._meta, self._folder = meta, folder
         self._files = _Files(meta.chunks_size)
         self._writer: pq.ParquetWriter | None = None
         self._path, self._place = folder, (0, 0)
+        self._group: list[pa.Table] = []
 
     def __enter__(self) -> "_RowFiles":
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._writer is not None:
-            self._writer.close()
+        self._close()
 
     def add(self, rows: pa.Table) -> tuple[int, int]:
-        """Append an episode; returns the chunk and file index of where it went."""
+        """Append an episode; returns the chunk and file index of where it goes."""
         if self._writer is not None:
             full = self._path.stat().st_size > self._meta.data_files_size_in_mb * MEGABYTE
             if full or not rows.schema.equals(self._writer.schema):  # the source's files may differ in their types
-                self._writer.close()
-                self._writer = None
+                self._close()
         if self._writer is None:
             self._place = self._files.take()
             chunk, file = self._place
             self._path = self._folder / self._meta.data_path.format(chunk_index=chunk, file_index=file)
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._writer = pq.ParquetWriter(self._path, rows.schema, compression="snappy", use_dictionary=True)
-        self._writer.write_table(rows, row_group_size=rows.num_rows)
+        self._group.append(rows)
+        if sum(part.num_rows for part in self._group) >= ROWS_IN_GROUP:
+            self._write_group()
         return self._place
+
+    def _write_group(self) -> None:
+        if self._writer is not None and self._group:
+            rows = pa.concat_tables(self._group)
+            self._writer.write_table(rows, row_group_size=rows.num_rows)
+            self._group = []
+
+    def _close(self) -> None:
+        self._write_group()
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
 
 
 class _Assembly:

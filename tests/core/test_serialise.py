@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from lerobot_msdyn.core import serialise
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.serialise import ValueFileError, load_value, save_value
 from lerobot_msdyn.dataset.encode import StagedPictures
@@ -30,7 +31,9 @@ def same(a: Any, b: Any) -> bool:
     return bool(a == b)
 
 
-def test_round_trip(tmp_path: Path) -> None:
+@pytest.mark.parametrize("small", [0, serialise.SMALL])
+def test_round_trip(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small: int) -> None:
+    monkeypatch.setattr(serialise, "SMALL", small)
     camera = CameraTrack(torch.eye(3).expand(2, 3, 3), torch.eye(4).repeat(2, 1, 1), 64, 48)
     value = {
         "camera": camera,
@@ -51,8 +54,10 @@ def test_what_cannot_be_kept(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("small", [0, serialise.SMALL])
 @pytest.mark.parametrize("content", [b"", b"{}", b"\x00" * 100])
-def test_a_damaged_file(tmp_path: Path, content: bytes) -> None:
+def test_a_damaged_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: bytes, small: int) -> None:
+    monkeypatch.setattr(serialise, "SMALL", small)
     (tmp_path / "value").write_bytes(content)
     with pytest.raises(ValueFileError, match="cannot be read"):
         load_value(tmp_path / "value", tmp_path)
