@@ -1,7 +1,8 @@
 """Frames of a video that flash: somewhere brighter, or darker, than the frames before and after.
 
-What is seen for one frame only, as a fault of a single overlay, is no motion: where things move, a place passes from one
-brightness to another. All frames of a new view are looked at as they are rendered, outside of what was recorded too.
+What is seen for one frame only, as a fault of a single overlay, is no motion: where things move, a place passes from
+one brightness to another. All frames of a new view are looked at as they are rendered, also outside of what was
+recorded.
 """
 
 from collections.abc import Iterable, Iterator
