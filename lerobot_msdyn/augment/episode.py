@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lerobot_msdyn.augment.backgrounds import Backgrounds
 from lerobot_msdyn.augment.recorded import read_recorded
-from lerobot_msdyn.core.config import Recipe
+from lerobot_msdyn.core.config import GateConfig, Recipe
 from lerobot_msdyn.core.errors import ConfigError, EpisodeError
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.dataset.calibration import read_calibration
@@ -29,6 +29,7 @@ from lerobot_msdyn.reconstruction.result import Reconstruction
 from lerobot_msdyn.render.devices import chosen_device
 from lerobot_msdyn.scene import store
 from lerobot_msdyn.scene.store import SceneSource
+from lerobot_msdyn.views.flashes import Flash, Flashes, largest_flash, too_large
 from lerobot_msdyn.views.gate import judge, reasons, record
 from lerobot_msdyn.views.new_cameras import NewCameras, new_cameras
 from lerobot_msdyn.views.pictures import Picture, UnseenMasks, log_uncovered, new_pictures, on_device
@@ -43,6 +44,7 @@ class Noted(NamedTuple):
 
     defects: list[str]  # of its pictures, in words
     displaced_px: float | None  # of 320: how far it begins from where it did in episode 0; None: unknown
+    flash: Flash  # its largest
 
 
 def augment_episode(
@@ -65,7 +67,8 @@ def augment_episode(
     episode, defects = read_recorded(source, index, cameras, recipe)
     noted = {}
     for key, found in defects.items():
-        noted[key] = Noted(found.lines(), _displaced_px(source, key, episode.views[key]))
+        view = episode.views[key]
+        noted[key] = Noted(found.lines(), _displaced_px(source, key, view), largest_flash(view.rgb.numpy()))
         if noted[key].defects:
             logger.warning("%s episode %d, %s: %s", source.repo_id, index, key, "; ".join(noted[key].defects))
     other = _other_pose(recipe, index, episode.views[cameras[0]]) if cameras else None
@@ -122,8 +125,28 @@ def _rendered(
         view["defects"] = noted[key].defects
     seconds = {"judging": round(time.perf_counter() - start, 1)}
     seconds |= {f"fitting {key}": round(scene.seconds["fit"], 1) for key, scene in scenes.items()}
-    new = _staged(source, index, variant, recipe, output, scenes, chosen, gate, dropped=dropped)
+    flashes = Flashes()
+    new = _staged(source, index, variant, recipe, output, scenes, chosen, gate, flashes, dropped=dropped)
+    if recipe.gate.enabled and not dropped:
+        new = _without_flashes(new, flashes, noted, recipe.gate)
     return replace(new, seconds=seconds)
+
+
+def _without_flashes(new: NewEpisode, flashes: Flashes, noted: Mapping[str, Noted], config: GateConfig) -> NewEpisode:
+    """The same, or a dropped one where a frame flashes."""
+    views, why = {}, []
+    for key, view in new.provenance.gate["views"].items():
+        largest = flashes.largest(key)
+        views[key] = view | {"flash": largest.entry()}
+        reason = too_large(largest, noted[key].flash, config)
+        why += [f"{key}: {reason}"] if reason else []
+    dropped = "; ".join(why)
+    rejected = new.provenance.gate["rejected"] + ([dropped] if dropped else [])
+    provenance = replace(new.provenance, gate={"views": views, "rejected": rejected})
+    if dropped:
+        logger.warning("episode %d variant %d: dropped: %s", new.source_index, provenance.variant, dropped)
+        return NewEpisode(new.source_index, provenance, dropped=dropped)
+    return replace(new, provenance=provenance)
 
 
 def _accepted(
@@ -174,6 +197,7 @@ def _staged(
     scenes: Mapping[str, Reconstruction],
     chosen: NewCameras,
     gate: dict[str, Any],
+    flashes: Flashes,
     *,
     dropped: str,
 ) -> NewEpisode:
@@ -192,6 +216,7 @@ def _staged(
     pictures = {
         key: log_uncovered(new_pictures(scene, chosen.cameras[key], fill=recipe.fill)) for key, scene in scenes.items()
     }
+    pictures = {key: flashes.kept(key, frames) for key, frames in pictures.items()}
     masks = UnseenMasks() if recipe.masks else None
     if masks is not None:
         pictures = {key: masks.kept(key, frames) for key, frames in pictures.items()}

@@ -333,6 +333,8 @@ class GateConfig:
     max_track_px: float = between(8.0, 0, INFINITY)
     # Largest flicker of what stands still, relative to the video's own.
     max_flicker_ratio: float = between(2.0, 0, INFINITY)
+    # Largest flash, a frame that is brighter or darker somewhere than those before and after, relative to the video's.
+    max_flash_ratio: float = between(1.5, 0, INFINITY)
     # Smallest sharpness (variance of the Laplacian), relative to the video's.
     min_sharpness_ratio: float = between(0.1, 0, INFINITY)
     # How often a view that is rejected, by the gate or by max_unseen, is drawn again before it is dropped.

@@ -6,7 +6,7 @@ import math
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 from torch import Tensor
 
@@ -114,7 +114,12 @@ def _patch(
     taken: Bool[ndarray, "h w"],
     backend: str,
 ) -> FramePatch:
-    """The pixels that are taken as Gaussians, with colours that make the rendered picture the recorded one."""
+    """The pixels that are taken as Gaussians, with colours that make the rendered picture the recorded one.
+
+    What a pixel's Gaussian lacks of the recorded colour is added to its own, by no more than the contrast to the pixels
+    beside, which are what mixes with it. More is lacking where something else is seen through, as at the picture's
+    border: from another camera, that would be a bright line.
+    """
     camera, when = view.camera.select([frame]), torch.tensor([frame])
     chosen = torch.from_numpy(taken).reshape(-1)
     pixels = pixel_gaussians(view.rgb[frame], depth, view.camera, frame)[0].select(chosen)
@@ -124,7 +129,15 @@ def _patch(
     if len(first) == 0:
         return first
     rendered = render_patched(scene, camera, frame, first, backend).rgb[0].cpu().reshape(-1, 3)[chosen]
-    return FramePatch(pixels.means, pixels.quats, log_scales, (2 * recorded - rendered).clamp(0, 1.5), hidden)
+    most = _contrast(view.rgb[frame]).reshape(-1, 3)[chosen]
+    lacking = (recorded - rendered).clamp(-most, most)
+    return FramePatch(pixels.means, pixels.quats, log_scales, (recorded + lacking).clamp(0, 1.5), hidden)
+
+
+def _contrast(rgb: UInt8[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    """The range of each colour over a pixel and those beside, 0..1."""
+    picture = rgb.numpy()
+    return torch.from_numpy(cv2.dilate(picture, _BESIDE) - cv2.erode(picture, _BESIDE)).float() / 255
 
 
 def _hidden(

@@ -257,14 +257,17 @@ def test_what_the_gate_rejects_is_drawn_again_and_then_dropped(
         return dataclasses.replace(scores, expected_db=1.0) if len(drawn) in (1, 2, 3, 4) else scores
 
     monkeypatch.setattr(episodes, "judge", counted)
+    flashes = iter(("", "frame 2 flashes"))  # of variants 1 and 2
+    monkeypatch.setattr(episodes, "too_large", lambda *_: next(flashes))
     arguments = ["--repo", "local/desk", "--root", str(desk), "--new_root", str(tmp_path / "new"), "--episodes", "[0]"]
-    settings = ["--cameras", "[front]", "--variants", "2", "--gate.redraws", "2", *FAST]
+    settings = ["--cameras", "[front]", "--variants", "3", "--gate.redraws", "2", *FAST]
     assert augment.run([*arguments, *settings]) == 1
     said = capsys.readouterr().out
     assert "dropped: episode 0 variant 0: " in said
+    assert f"dropped: episode 0 variant 2: {FRONT}: frame 2 flashes" in said
     assert "1 new ones" in said
     assert f"{FRONT}: what moves: " in said
-    assert len(drawn) == 3 + 2
+    assert len(drawn) == 3 + 2 + 1
     poses = {tuple(camera.world_from_camera[0].flatten().tolist()) for camera in drawn}
     assert len(poses) == len(drawn)
     text = (tmp_path / "new" / "report.html").read_text()

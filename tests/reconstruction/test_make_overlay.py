@@ -129,6 +129,15 @@ def test_the_same_is_unexplained_at_any_size() -> None:
     assert shares[0][0] * 160 > 2 * 4, "more than the border itself"
 
 
+def test_what_has_one_colour_keeps_it(recorded: tuple[DynamicScene, View, Priors]) -> None:
+    """Where a pixel is half covered, along the picture's border too: brighter ones would be a line from elsewhere."""
+    scene, view, priors = recorded
+    bright = dataclasses.replace(view, rgb=view.rgb * 0 + 230)
+    colours = unexplained(scene, bright, priors).rgb
+    assert len(colours) > FRAMES * WIDTH
+    torch.testing.assert_close(colours.float(), torch.full_like(colours, 230 / 255).float(), atol=0.02, rtol=0)
+
+
 def test_overlays_are_saved(recorded: tuple[DynamicScene, View, Priors], tmp_path: Path) -> None:
     scene, view, priors = recorded
     mended = dataclasses.replace(scene, overlay=unexplained(scene, view, priors))
