@@ -89,10 +89,9 @@ def augment(config: AugmentConfig, opened: "Opened", new_repo_id: str, new_root:
 
 
 def _say_plan(config: AugmentConfig, opened: "Opened", new_root: Path) -> int:
-    from lerobot_msdyn.augment.run import plan
+    from lerobot_msdyn.augment.plan import plan
 
-    done = plan(opened.source, opened.episodes, opened.cameras, config)
-    sys.stdout.write(done + f"would be written to {new_root}\n")
+    sys.stdout.write(plan(opened.source, opened.episodes, opened.cameras, config, new_root))
     return EXIT_OK
 
 

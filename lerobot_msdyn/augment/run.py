@@ -15,17 +15,12 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 from lerobot_msdyn.augment.assumed_depth import say_assumed_depth
 from lerobot_msdyn.augment.backgrounds import background_episodes
 from lerobot_msdyn.augment.config import AugmentConfig
-from lerobot_msdyn.augment.cost import (
-    first_speeds,
-    predicted_output_bytes,
-    predicted_scene_bytes,
-    predicted_seconds,
-)
 from lerobot_msdyn.augment.episode import augment_episode
 from lerobot_msdyn.augment.failures import same_reason
+from lerobot_msdyn.augment.plan import camera_lines
 from lerobot_msdyn.augment.robot_cameras import calibrated
 from lerobot_msdyn.augment.run_identity import source_folder
-from lerobot_msdyn.augment.workers import Work, Workers, terse, threads_of_one, workers_for
+from lerobot_msdyn.augment.workers import Work, Workers, workers_for
 from lerobot_msdyn.core.errors import EpisodeError, MsdynError
 from lerobot_msdyn.dataset.convert import named_as_given
 from lerobot_msdyn.dataset.provenance import CALIBRATION
@@ -175,32 +170,12 @@ def _make(work: Work, index: int) -> Callable[[], list[NewEpisode]]:
     )
 
 
-def plan(source: LeRobotDatasetMetadata, episodes: list[int], cameras: list[str], config: AugmentConfig) -> str:
-    """What a run would do: episodes, pictures, disk and time, the last by doing a little of it."""
-    frames = sum(int(source.episodes[index]["length"]) for index in episodes)
-    variants = config.variants if cameras else 0
-    copies = variants + int(config.include_source)
-    disk = predicted_output_bytes(source, episodes, config)
-    count = workers_for(config, frames, len(episodes))
-    with threads_of_one(count), terse(config):
-        speeds = first_speeds(source, episodes, cameras, config)
-    seconds = predicted_seconds(speeds, source, episodes, config, count)
-    scenes = predicted_scene_bytes(speeds, source, episodes, config) if config.save_scenes else 0.0
-    with_scenes = f", {scenes / 1e6:.0f} MB of it saved scenes" if scenes else ""
-    return (
-        f"{source.repo_id}: {len(episodes)} episodes, {frames} frames; re-rendering {', '.join(cameras) or 'nothing'}\n"
-        f"{variants} new per episode: {len(episodes) * copies} episodes, {frames * copies} frames, "
-        f"{frames * variants * len(cameras)} new pictures\n"
-        f"about {(disk + scenes) / 1e6:.0f} MB on disk{with_scenes}, and about {seconds / 60:.1f} minutes "
-        f"on this machine, by {count} {'process' if count == 1 else 'processes'}, judging by a few frames and steps\n"
-    )
-
-
 def _say_what_is_assumed(source: LeRobotDatasetMetadata, cameras: list[str], config: AugmentConfig) -> None:
     """Once per run: what nobody measured."""
     if not cameras:
         return
-    logger.info("%s: re-rendering %s", source.repo_id, ", ".join(cameras))
+    for line in camera_lines(source, cameras, config):
+        logger.info("%s", line)
     if config.camera.calibration is None:
         logger.warning(
             "no calibration: cameras are taken as fixed, with a horizontal field of view of %g degrees "
