@@ -3,13 +3,11 @@
 import contextlib
 import functools
 import logging
-import sys
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from dataclasses import replace
 
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
-from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from lerobot_msdyn.augment.assumed_depth import say_assumed_depth
@@ -18,6 +16,7 @@ from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.augment.episode import augment_episode
 from lerobot_msdyn.augment.failures import same_reason
 from lerobot_msdyn.augment.plan import camera_lines
+from lerobot_msdyn.augment.progress import EpisodeBar
 from lerobot_msdyn.augment.robot_cameras import calibrated
 from lerobot_msdyn.augment.run_identity import source_folder
 from lerobot_msdyn.augment.workers import Work, Workers, workers_for
@@ -29,9 +28,6 @@ from lerobot_msdyn.dataset.write import NewEpisode, OutputDataset
 from lerobot_msdyn.render.devices import chosen_device
 
 logger = logging.getLogger(__name__)
-
-FORESEEN = 0.05  # share of the work after which what is left can be told
-UNWATCHED_S = 30.0  # between updates of a progress bar that nobody watches
 
 
 def prepared(
@@ -71,20 +67,14 @@ def run_local(
     config, problems = prepared(source, episodes, cameras, config, output)
     failures: dict[int, str] = {}
     reasons: set[str] = set()
-    bar_format = "{desc} |{bar}| {percentage:3.0f} % of {total} episodes [{elapsed}"
-    watched = sys.stderr.isatty()  # in a file a bar has a line per update
-    interval_s = 0.1 if watched else UNWATCHED_S
-    plain = functools.partial(tqdm, bar_format=f"{bar_format}]", mininterval=interval_s, smoothing=0)
-    with logging_redirect_tqdm(), plain(total=len(episodes)) as bar:
+    with logging_redirect_tqdm(), EpisodeBar(len(episodes)) as bar:
 
         def progress(what: str, share: float) -> None:
             if what:
-                bar.set_description_str(what, refresh=watched)
-            bar.update(min(share, len(episodes) - bar.n))  # shares add up to one only up to rounding
-            if bar.n >= FORESEEN * len(episodes):
-                bar.bar_format = f"{bar_format}<{{remaining}}]"
+                bar.begin(what)
+            bar.advance(share)
 
-        bar.set_description_str("looking at the background", refresh=watched)
+        bar.begin("looking at the background")
         work = Work(source, cameras, config, output, progress)
         for index, failure in attempts(work, episodes, problems):
             if failure is None:
@@ -94,7 +84,7 @@ def run_local(
             if reason not in reasons:
                 reasons.add(reason)
                 logger.error("skipped: %s", failures[index])
-        bar.update(len(episodes) - bar.n)
+        bar.advance(len(episodes))
     return failures
 
 

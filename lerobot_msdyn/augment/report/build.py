@@ -154,10 +154,17 @@ def entries_of(episodes: Sequence[NewEpisode]) -> tuple[list[ViewEntry], dict[in
                 amounts, rejected = origin.perturbation[camera], origin.gate["rejected"]
                 view = view | origin.views[camera]
                 dropped = bool(episode.dropped)
-                pictures = {"sheet": episode.sheets.get(camera), "frame": episode.frames.get(camera)}
                 entries.append(
                     ViewEntry(
-                        episode.source_index, origin.variant, camera, amounts, view, rejected, dropped, **pictures
+                        episode.source_index,
+                        origin.variant,
+                        camera,
+                        amounts,
+                        view,
+                        rejected,
+                        dropped,
+                        sheet=episode.sheets.get(camera),
+                        frame=episode.frames.get(camera),
                     )
                 )
         index += not episode.dropped
