@@ -27,7 +27,7 @@ from torch import Tensor
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.config import CameraConfig
 from lerobot_msdyn.core.errors import DatasetError, EpisodeError, first_line
-from lerobot_msdyn.core.files import cache_folder
+from lerobot_msdyn.core.files import cache_folder, check_root
 from lerobot_msdyn.core.observations import RobotSeen, View
 from lerobot_msdyn.dataset.calibration import make_camera, read_robot
 from lerobot_msdyn.dataset.checks import IntactEpisodes, check_metadata, picture_size, read_json
@@ -104,10 +104,7 @@ def open_source(
     folder = HF_LEROBOT_HOME / repo_id if root is None else root
     if not (folder / "meta" / "info.json").exists():
         if root is not None:
-            raise DatasetError(
-                f"no dataset in {root}: {root / 'meta' / 'info.json'} is absent; "
-                "--root is the exact folder that holds meta/, data/ and videos/"
-            )
+            check_root(root)
         folder = _from_hub(repo_id, folder)
     check_version(folder)
     intact = check_metadata(folder)

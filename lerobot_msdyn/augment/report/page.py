@@ -254,7 +254,7 @@ def _cameras(entries: Sequence[ViewEntry]) -> str:
     lines = camera_lines(entries)
     more = [f"{len(lines) - LISTED} more are in meta/msdyn/episodes.parquet"] if len(lines) > LISTED else []
     what = bullets(lines[:LISTED] + more) if lines else "<p>They keep still.</p>"
-    return f"<h2>Recorded cameras (px of 320)</h2>{what}"
+    return f"<h2>Did the recorded cameras move? (px, at a width of 320)</h2>{what}"
 
 
 def _sheets(pictures: Mapping[str, str]) -> str:
@@ -284,7 +284,7 @@ def _links(pictures: Mapping[str, str]) -> str:
     if not pictures:
         return ""
     shown = "".join(f'<p>{text(name)}</p><img src="{url}" alt="{text(name)}">' for name, url in pictures.items())
-    return f"<h2>The robot's links by its joints</h2>{shown}"
+    return f"<h2>Where the joints say that the robot is</h2>{shown}"
 
 
 def text(value: object) -> str:
