@@ -29,9 +29,8 @@ def run(arguments: list[str]) -> int:
     if name in ("-h", "--help"):
         width = max(map(len, COMMANDS))
         lines = [f"  {each:{width}s}  {purpose}\n" for each, (_, purpose) in COMMANDS.items()]
-        sys.stdout.write(
-            f"usage: lerobot-msdyn COMMAND ...\n\n{''.join(lines)}\nMore about one of them: lerobot-msdyn COMMAND --help\n"
-        )
+        more = "More about one of them: lerobot-msdyn COMMAND --help"
+        sys.stdout.write(f"usage: lerobot-msdyn COMMAND ...\n\n{''.join(lines)}\n{more}\n")
         return EXIT_OK
     known = name.replace("_", "-")
     if known not in COMMANDS:

@@ -5,6 +5,7 @@ python -m lerobot_msdyn.viewer --repo local/ds --episode 0 [--scenes FOLDER] [--
 
 import logging
 import os
+import socket
 import sys
 import threading
 import urllib.parse
@@ -102,16 +103,21 @@ def _serve(config: ViewerConfig, stream: "rr.RecordingStream") -> None:
     """
     import rerun as rr
 
+    ports = (config.web_port, config.data_port)
     try:
+        for port in ports:  # Rerun reports a taken port only later, in a thread of its own
+            with socket.socket() as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind(("", port))
         data = stream.serve_grpc(grpc_port=config.data_port, server_memory_limit=SERVED_MEMORY)
         rr.serve_web_viewer(web_port=config.web_port, open_browser=_has_display(), connect_to=data)
     except (RuntimeError, ValueError, OSError) as error:
         raise OutputError(
-            f"nothing can be served on ports {config.web_port} and {config.data_port}: {error}; choose others by "
-            "--web_port and --data_port, or write a file by --save FILE.rrd"
+            f"nothing can be served on port {port}: {error}; choose others by --web_port and --data_port, or write a "
+            "file by --save FILE.rrd"
         ) from error
     page = f"http://localhost:{config.web_port}/?url={urllib.parse.quote(data, safe='')}"
-    forwarded = " ".join(f"-L {port}:localhost:{port}" for port in (config.web_port, config.data_port))
+    forwarded = " ".join(f"-L {port}:localhost:{port}" for port in ports)
     sys.stdout.write(f"open {page}\nfrom another machine, first: ssh {forwarded} THIS_MACHINE\n")
     sys.stdout.flush()
 
