@@ -1,8 +1,10 @@
-"""The main job on a small synthetic dataset: write it, augment it, load the result with LeRobot, look at it.
+"""The main job on one small synthetic episode: write it, augment it, load the result with LeRobot, look at it.
 
-make demo
+make demo              the episode has recorded depth
+make demo-no-depth     it has colour alone, as a webcam gives it
 """
 
+import argparse
 import shutil
 import subprocess
 import sys
@@ -16,6 +18,7 @@ from lerobot.datasets import LeRobotDataset
 
 OUT = Path("demo_out")
 CAMERA = "observation.images.front"
+RECORDED, NEW = 0, 1  # episodes of the output
 COPIED = ("action", "observation.state", "timestamp", "frame_index", "task_index")
 
 
@@ -32,8 +35,7 @@ def picture(item: dict) -> np.ndarray:
 
 def before_after(source: LeRobotDataset, output: LeRobotDataset, path: Path, columns: int = 4) -> None:
     """Recorded frames above, the same frames of the new episode below."""
-    start = output.meta.episodes[1]["dataset_from_index"]  # episode 0 is the copy of the recorded one
-    length = output.meta.episodes[1]["length"]
+    start, length = (output.meta.episodes[NEW][name] for name in ("dataset_from_index", "length"))
     frames = np.linspace(0.1 * length, 0.9 * length, columns).astype(int)
     rows = [
         np.concatenate([picture(source[int(i)]) for i in frames], axis=1),
@@ -44,27 +46,27 @@ def before_after(source: LeRobotDataset, output: LeRobotDataset, path: Path, col
 
 def main() -> None:
     """Run the demo."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--no_depth", action="store_true", help="record colour alone")
+    depth = [] if parser.parse_args().no_depth else ["--depth"]
     begin = time.perf_counter()
     shutil.rmtree(OUT, ignore_errors=True)
-    size = ["--width", "320", "--height", "240"]
-    run("lerobot_msdyn.synthetic", "--out", str(OUT / "desk"), "--kind", "push", "--episodes", "2", "--depth", *size)
+    size = ["--episodes", "1", "--frames", "30", "--width", "320", "--height", "240"]
+    run("lerobot_msdyn.synthetic", "--out", str(OUT / "desk"), "--kind", "push", *size, *depth)
     run("lerobot_msdyn.augment", "--repo", "local/desk", "--root", str(OUT / "desk"), "--recipe", "quick")
 
     source = LeRobotDataset("local/desk", root=OUT / "desk", video_backend="pyav")
     output = LeRobotDataset("local/desk_msdyn", root=OUT / "desk_msdyn", video_backend="pyav")
-    recorded = source.meta.episodes["length"]
-    origin = [episode for episode in range(len(recorded)) for _ in range(2)]  # each: its copy, then its new variant
-    for new, old in enumerate(origin):
-        first_new = output.meta.episodes[new]["dataset_from_index"]
-        first_old = source.meta.episodes[old]["dataset_from_index"]
-        for i in range(recorded[old]):
-            a, b = source[first_old + i], output[first_new + i]
-            if not all(torch.equal(a[key], b[key]) for key in COPIED):
-                raise SystemExit(f"episode {new}, frame {i}: not the source's values")
+    recorded, made = source.hf_dataset, output.hf_dataset  # the rows, without the videos
+    for episode in (RECORDED, NEW):
+        rows = made.select(range(episode * len(recorded), (episode + 1) * len(recorded)))
+        if not all(torch.equal(torch.stack(rows[key][:]), torch.stack(recorded[key][:])) for key in COPIED):
+            raise SystemExit(f"episode {episode}: not the source's values")
     path = OUT / "before_after.png"
     before_after(source, output, path)
     print(f"\nLeRobot loads {OUT}/desk_msdyn: {output.num_episodes} episodes, {len(output)} frames, same actions.")
-    print(f"before (top) and after (bottom): {path.resolve()}")
+    print(f"recorded (top) and new (bottom): {path.resolve()}")
+    print(f"every new view and what to expect of it: {(OUT / 'desk_msdyn' / 'report.html').resolve()}")
     print(f"{time.perf_counter() - begin:.0f} s")
 
 

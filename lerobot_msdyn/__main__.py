@@ -9,16 +9,16 @@ from lerobot_msdyn.core.errors import ConfigError
 
 COMMANDS = {  # name -> module, purpose
     "augment": ("augment.__main__", "write new episodes of a dataset, seen from displaced cameras"),
-    "cluster": ("cluster.__main__", "the same in many tasks: one machine, SLURM or Ray"),
+    "cluster": ("cluster.__main__", "the same, split into many tasks: one machine, SLURM or Ray"),
     "viewer": ("viewer", "look at an episode, its scene and its new views in Rerun"),
-    "priors": ("priors.__main__", "look at masks, depth and tracks of an episode"),
-    "models": ("models", "list, fetch and check the models that help"),
-    "calibrate": ("calibrate", "where the cameras stand, by the robot's joints"),
+    "priors": ("priors.__main__", "look at the masks, depth and tracks of an episode"),
+    "models": ("models", "list, fetch and check the learned models"),
+    "calibrate": ("calibrate", "find where the cameras stand, from the robot's joints"),
     "recipes": ("recipes", "list, show and check recipes"),
-    "export-ply": ("export_ply", "frames of a kept scene as .ply files"),
-    "split": ("split", "train and evaluation episodes with no recording on both sides"),
-    "carry": ("carry", "provenance for datasets that LeRobot's tools made of others"),
-    "evaluate": ("evaluate.__main__", "score reconstructions on views that were not fitted"),
+    "export-ply": ("export_ply", "export frames of a saved scene as .ply files"),
+    "split": ("split", "training and evaluation episodes that share no recording"),
+    "carry": ("carry", "keep the provenance of datasets that LeRobot's tools merged or cut"),
+    "evaluate": ("evaluate.__main__", "score reconstructions on held-out views"),
     "synthetic": ("synthetic.__main__", "make small datasets with ground truth"),
 }
 
@@ -29,7 +29,8 @@ def run(arguments: list[str]) -> int:
     if name in ("-h", "--help"):
         width = max(map(len, COMMANDS))
         lines = [f"  {each:{width}s}  {purpose}\n" for each, (_, purpose) in COMMANDS.items()]
-        sys.stdout.write(f"usage: lerobot-msdyn COMMAND ...\n\n{''.join(lines)}\nlerobot-msdyn COMMAND --help: more\n")
+        more = "More about one of them: lerobot-msdyn COMMAND --help"
+        sys.stdout.write(f"usage: lerobot-msdyn COMMAND ...\n\n{''.join(lines)}\n{more}\n")
         return EXIT_OK
     known = name.replace("_", "-")
     if known not in COMMANDS:

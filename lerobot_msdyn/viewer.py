@@ -1,10 +1,14 @@
 """Command line: look at an episode, its priors, its scene and its new views in Rerun, on one timeline.
 
-python -m lerobot_msdyn.viewer --repo local/ds --episode 0 [--scenes FOLDER] [--save FILE.rrd]
+python -m lerobot_msdyn.viewer --repo local/ds --episode 0 [--scenes FOLDER] [--web | --save FILE.rrd]
 """
 
 import logging
+import os
+import socket
 import sys
+import threading
+import urllib.parse
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,6 +32,8 @@ logger = logging.getLogger(__name__)
 
 COMMAND = "python -m lerobot_msdyn.viewer"
 ALIASES = {"repo": "repo_id"}
+MAX_PORT = 65535
+SERVED_MEMORY = "50%"  # of this machine's, at most, for what a browser may still ask for
 FRUSTUM_SHARE = 0.15  # length of a frustum as a share of the look-at distance
 GOLDEN = 0.618034  # of the circle of hues, from one index to the next
 
@@ -44,6 +50,12 @@ class ViewerConfig(Recipe):
     episode: int = between(0, 0, MAX_INDEX)
     # Output folder of `augment --save_scenes true`; without it the episode is fitted first.
     scenes: Path | None = None
+    # Show it in a browser tab, served by this machine until Ctrl-C; also done where there is no display for a window.
+    web: bool = False
+    # Port of the page; the data come by --data_port.
+    web_port: int = between(9090, 1, MAX_PORT)
+    # Port of the data.
+    data_port: int = between(9876, 1, MAX_PORT)
     # A .rrd file to write instead of opening a window.
     save: Path | None = None
 
@@ -60,17 +72,64 @@ def run(arguments: list[str]) -> int:
     if config.save is not None and not config.save.parent.is_dir():
         raise OutputError(f"--save {config.save}: no folder {config.save.parent}")
     stream = rr.RecordingStream("lerobot_msdyn")
-    if config.save is None:
-        stream.spawn()
-    else:
-        stream.save(config.save)
-    show_episode(config, stream)
-    stream.flush()
     if config.save is not None:
-        sys.stdout.write(
-            f"{config.save}  {config.save.stat().st_size / 1e6:.0f} MB; open it with: rerun {config.save}\n"
-        )
+        stream.save(config.save)
+        show_episode(config, stream)
+        stream.flush()
+        size_mb = config.save.stat().st_size / 1e6
+        sys.stdout.write(f"{config.save}  {size_mb:.0f} MB; open it with: rerun {config.save}\n")
+    elif config.web or not _has_display():
+        _serve(config, stream)
+        show_episode(config, stream)
+        stream.flush()
+        _wait()
+    else:
+        stream.spawn()
+        show_episode(config, stream)
+        stream.flush()
     return EXIT_OK
+
+
+def _has_display() -> bool:
+    """Whether a window can be opened."""
+    return not sys.platform.startswith("linux") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _serve(config: ViewerConfig, stream: "rr.RecordingStream") -> None:
+    """Serve what is logged, and a page that shows it.
+
+    Raises:
+        OutputError: a port is taken.
+    """
+    import rerun as rr
+
+    ports = (config.web_port, config.data_port)
+    try:
+        for port in ports:  # Rerun reports a taken port only later, in a thread of its own
+            with socket.socket() as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind(("", port))
+        data = stream.serve_grpc(grpc_port=config.data_port, server_memory_limit=SERVED_MEMORY)
+        rr.serve_web_viewer(web_port=config.web_port, open_browser=_has_display(), connect_to=data)
+    except (RuntimeError, ValueError, OSError) as error:
+        raise OutputError(
+            f"nothing can be served on port {port}: {error}; choose others by --web_port and --data_port, or write a "
+            "file by --save FILE.rrd"
+        ) from error
+    page = f"http://localhost:{config.web_port}/?url={urllib.parse.quote(data, safe='')}"
+    forwarded = " ".join(f"-L {port}:localhost:{port}" for port in ports)
+    sys.stdout.write(f"open {page}\nfrom another machine, first: ssh {forwarded} THIS_MACHINE\n")
+    sys.stdout.flush()
+
+
+def _wait() -> None:
+    """Until Ctrl-C."""
+    sys.stdout.write("all frames are there; Ctrl-C ends\n")
+    sys.stdout.flush()
+    try:
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        sys.stdout.write("\n")
 
 
 def show_episode(config: ViewerConfig, stream: "rr.RecordingStream") -> None:

@@ -26,11 +26,11 @@ def commands() -> list[str]:
 def test_every_command_is_run_somewhere() -> None:
     ci = (PROJECT / ".ci" / "run").read_text().splitlines()
     assert set(ci) >= IN_CI
-    assert set(commands()) - IN_CI - BY_THE_WHEEL_TEST == {augment_command(), train_command()}
+    assert set(commands()) - IN_CI - BY_THE_WHEEL_TEST == {*augment_commands(), train_command()}
 
 
-def augment_command() -> str:
-    return next(command for command in commands() if "lerobot_msdyn.augment" in command)
+def augment_commands() -> list[str]:
+    return [command for command in commands() if "lerobot_msdyn.augment" in command]
 
 
 def train_command() -> str:
@@ -48,10 +48,21 @@ def run(command: list[str], home: Path) -> str:
 
 @pytest.mark.slow
 def test_augment_and_train(tmp_path: Path) -> None:
-    write_dataset([make_scene("push", 0, 10, 64, 48)], "local/ds", tmp_path / "local" / "ds")
-    printed = run(shlex.split(augment_command()), tmp_path)
-    assert "1 of 1 episodes, 2 new ones" in printed
+    augment = augment_commands()[0]
+    assert "2 new ones" in augmented(augment, tmp_path)
     assert (tmp_path / "local" / "ds_msdyn" / "meta" / "info.json").is_file()
     printed = run([*shlex.split(train_command()), f"--output_dir={tmp_path / 'run'}", *SMALL_ACT], tmp_path)
     assert "dataset.num_episodes=3" in printed
     assert "End of training" in printed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", augment_commands()[1:])
+def test_the_other_ways_to_augment(command: str, tmp_path: Path) -> None:
+    assert "1 of 1 episodes, 2 new ones" in augmented(command, tmp_path)
+
+
+def augmented(command: str, home: Path) -> str:
+    """What the command says of a dataset of the name that it takes."""
+    write_dataset([make_scene("push", 0, 10, 64, 48)], "local/ds", home / "local" / "ds")
+    return run(shlex.split(command), home)

@@ -1,5 +1,7 @@
 """The viewer's recording, without a screen."""
 
+import socket
+import urllib.request
 from pathlib import Path
 
 import pytest
@@ -44,3 +46,41 @@ def test_bad_input_is_named(desk: Path, desk_scenes: Path, tmp_path: Path) -> No
         viewer.run([*source, "--scenes", str(desk_scenes), "--episode", "2"])
     with pytest.raises(OutputError, match="no folder"):
         viewer.run([*source, "--save", str(tmp_path / "absent" / "a.rrd")])
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("", 0))
+        return int(probe.getsockname()[1])
+
+
+@pytest.mark.filterwarnings("ignore:.*is deprecated since 0.32:DeprecationWarning")
+def test_without_a_display_it_is_served_to_a_browser(
+    desk: Path, desk_scenes: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(viewer.sys, "platform", "linux")
+    web, data = free_port(), free_port()
+    pages: list[str] = []
+
+    def look() -> None:
+        with urllib.request.urlopen(f"http://localhost:{web}/", timeout=30) as page:
+            pages.append(page.read().decode())
+
+    monkeypatch.setattr(viewer, "_wait", look)
+    source = ["--repo", "local/desk", "--root", str(desk), "--scenes", str(desk_scenes), "--variants", "1"]
+    assert viewer.run([*source, "--web_port", str(web), "--data_port", str(data)]) == 0
+    assert f"open http://localhost:{web}/?url=rerun" in capsys.readouterr().out
+    assert "<html" in pages[0]
+
+
+@pytest.mark.parametrize("taken", ["--web_port", "--data_port"])
+def test_a_taken_port_is_named(taken: str, desk: Path) -> None:
+    ports = {"--web_port": free_port(), "--data_port": free_port()}
+    with socket.socket() as other:
+        other.bind(("", ports[taken]))
+        other.listen()
+        flags = [text for flag, port in ports.items() for text in (flag, str(port))]
+        with pytest.raises(OutputError, match=f"served on port {ports[taken]}: .*--web_port"):
+            viewer.run(["--repo", "local/desk", "--root", str(desk), "--web", *flags])

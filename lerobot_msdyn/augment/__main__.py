@@ -3,6 +3,7 @@
 python -m lerobot_msdyn.augment --repo local/ds
 """
 
+import logging
 import sys
 import time
 from pathlib import Path
@@ -11,10 +12,13 @@ from typing import TYPE_CHECKING
 from lerobot_msdyn.augment.config import ESSENTIALS, AugmentConfig
 from lerobot_msdyn.core.cli import EXIT_INTERRUPTED, EXIT_OK, EXIT_SOME_EPISODES_FAILED, parse_config, run_command
 from lerobot_msdyn.core.errors import ConfigError, MsdynError
+from lerobot_msdyn.core.files import check_root
 
 if TYPE_CHECKING:
     from lerobot_msdyn.augment.job import Opened
     from lerobot_msdyn.dataset.staging import Staging
+
+logger = logging.getLogger(__name__)
 
 COMMAND = "python -m lerobot_msdyn.augment"
 ALIASES = {"repo": "repo_id"}
@@ -25,6 +29,9 @@ def run(arguments: list[str]) -> int:
     config = parse_config(AugmentConfig, arguments, ALIASES, command=COMMAND, essentials=ESSENTIALS)
     if not config.repo_id:
         raise ConfigError(f"which dataset? {COMMAND} --repo NAME [--root FOLDER] (see --help)")
+    if config.root is not None:
+        check_root(config.root)
+    logger.info("opening %s", config.root or config.repo_id)
     # LeRobot and torch take seconds to import: only now, so that --help and bad flags are answered at once.
     from lerobot_msdyn.augment.job import finished_before, open_job, place_of
     from lerobot_msdyn.augment.run_identity import source_folder
@@ -89,10 +96,9 @@ def augment(config: AugmentConfig, opened: "Opened", new_repo_id: str, new_root:
 
 
 def _say_plan(config: AugmentConfig, opened: "Opened", new_root: Path) -> int:
-    from lerobot_msdyn.augment.run import plan
+    from lerobot_msdyn.augment.plan import plan
 
-    done = plan(opened.source, opened.episodes, opened.cameras, config)
-    sys.stdout.write(done + f"would be written to {new_root}\n")
+    sys.stdout.write(plan(opened.source, opened.episodes, opened.cameras, config, new_root))
     return EXIT_OK
 
 

@@ -16,22 +16,22 @@ class AugmentConfig(Recipe):
     repo_id: str = ""
     # Exact folder of the source dataset; default: LeRobot's home, then the hub.
     root: Path | None = None
-    # Name of the new dataset; default: the source's with _msdyn behind it.
+    # Name of the new dataset; default: the source's name followed by _msdyn.
     new_repo_id: str | None = None
     # Exact folder of the new dataset; default: LeRobot's home, or beside --root.
     new_root: Path | None = None
     # Source episodes to use, e.g. 0, 0,3 or 0-9; default: all.
     episodes: list[int] | None = None
-    # How far (s) a video frame may be from its row's time, as LeRobot's tolerance_s; of no matter where a video has as
-    # many frames as its episode has rows: these belong together by their number.
+    # How far (s) a video frame may be from its row's time, as LeRobot's tolerance_s; irrelevant where a video has
+    # as many frames as its episode has rows, which are then matched by number.
     tolerance_s: float = between(1e-4, 0.0, 1.0)
-    # Processes that work on episodes at once; 0: one per core, as far as memory allows. The result is the same.
+    # Episodes that are worked on at the same time; 0: one per core, as far as memory allows. The result is the same.
     workers: int = between(0, 0, 1024)
     # Report what would be done (episodes, disk, time) and stop.
     dry_run: bool = False
-    # Say what each stage finds in each episode, not only how each episode went.
+    # Log what each stage finds in each episode, not only how each episode went.
     verbose: bool = False
-    # Throw away what an unfinished run for the same output has finished, instead of going on with it.
+    # Discard what an unfinished run for the same output has finished, instead of continuing it.
     restart: bool = False
     # Download a depth model where depth would otherwise be assumed (a table plane).
     fetch_models: bool = False

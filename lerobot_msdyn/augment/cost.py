@@ -14,6 +14,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot_msdyn.augment.backgrounds import looked_at
 from lerobot_msdyn.augment.episode import by_feature
 from lerobot_msdyn.augment.recorded import read_recorded
+from lerobot_msdyn.augment.report.build import PICTURED
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import EpisodeError, OutputError
 from lerobot_msdyn.core.observations import View
@@ -27,6 +28,7 @@ logger = logging.getLogger(__name__)
 
 PROBE_FRAMES = 24
 PROBE_STEPS = 14
+REPORT_BYTES = 3e5  # of the report, for each view with pictures
 MASKS_SHARE = 0.3  # of the time of priors and initial scene
 GROWING = ("overlay.", "shading.field", "shading.moving")  # tensors of a scene with a part for every frame
 WARM_UP_STEPS = 4  # the first ones compile, and fill caches
@@ -42,6 +44,8 @@ class Speeds:
     render_s: float  # per new frame, encoded
     scene_bytes: float = 0.0  # of the saved scenes of an episode, however long ...
     frame_bytes: float = 0.0  # ... and for each of its frames
+    video_bytes: float = 0.0  # per new frame: what was rendered and encoded as video
+    videos: tuple[str, ...] = ()  # features that were
 
 
 def first_speeds(source: LeRobotDatasetMetadata, episodes: Sequence[int], cameras: list[str], recipe: Recipe) -> Speeds:
@@ -80,7 +84,8 @@ def measure_speeds(source: LeRobotDatasetMetadata, index: int, cameras: list[str
     views = episode.views
     if not recipe.needs_whole_videos:
         views = {key: _middle(view) for key, view in views.items()}
-    prepare_s = step_s = render_s = scene_bytes = frame_bytes = 0.0
+    prepare_s = step_s = render_s = scene_bytes = frame_bytes = video_bytes = 0.0
+    videos: list[str] = []
     for key, part in views.items():
         ticks: list[float] = []
 
@@ -101,17 +106,39 @@ def measure_speeds(source: LeRobotDatasetMetadata, index: int, cameras: list[str
             start = time.perf_counter()
             scene_here = on_device(scene, chosen_device(recipe.device))
             pictures = by_feature(source, {key: new_pictures(scene_here, part.camera)})
-            stage_pictures(source, Path(folder), pictures, len(part.rgb))
+            staged = stage_pictures(source, Path(folder), pictures, len(part.rgb))
             render_s += (time.perf_counter() - start) / len(part.rgb)
-    return Speeds(read_s, prepare_s, step_s, render_s, scene_bytes, frame_bytes)
+            videos += staged.videos
+            video_bytes += sum(file.stat().st_size for file in staged.videos.values()) / len(part.rgb)
+    return Speeds(read_s, prepare_s, step_s, render_s, scene_bytes, frame_bytes, video_bytes, tuple(videos))
 
 
 def predicted_output_bytes(source: LeRobotDatasetMetadata, episodes: list[int], recipe: Recipe) -> float:
     """Disk for the new dataset without saved scenes: each of its frames takes what one of the source takes."""
-    frames = sum(int(source.episodes[index]["length"]) for index in episodes)
-    files = (file for part in ("data", "videos") for file in (source.root / part).rglob("*") if file.is_file())
-    size = sum(file.stat().st_size for file in files)
-    return size * frames * (recipe.variants + int(recipe.include_source)) / max(source.total_frames, 1)
+    share = frames_of(source, episodes) / max(source.total_frames, 1)
+    return _size_of(source, "data", "videos") * share * (recipe.variants + int(recipe.include_source))
+
+
+def predicted_bytes(speeds: Speeds, source: LeRobotDatasetMetadata, episodes: list[int], recipe: Recipe) -> float:
+    """Disk for the new dataset without saved scenes, its new videos as a few of their frames were encoded."""
+    frames = frames_of(source, episodes)
+    copied = predicted_output_bytes(source, episodes, recipe)
+    share = frames / max(source.total_frames, 1)
+    recorded = _size_of(source, *(f"videos/{key}" for key in speeds.videos)) * share
+    views = len(episodes) * recipe.variants * len(speeds.videos)
+    report = REPORT_BYTES * min(views, PICTURED)
+    return copied + recipe.variants * (frames * speeds.video_bytes - recorded) + report
+
+
+def frames_of(source: LeRobotDatasetMetadata, episodes: Sequence[int]) -> int:
+    """Of some episodes together."""
+    return sum(int(source.episodes[index]["length"]) for index in episodes)
+
+
+def _size_of(source: LeRobotDatasetMetadata, *folders: str) -> int:
+    """Bytes of all files in some folders of a dataset."""
+    files = (file for folder in folders for file in (source.root / folder).rglob("*") if file.is_file())
+    return sum(file.stat().st_size for file in files)
 
 
 def check_disk(source: LeRobotDatasetMetadata, episodes: list[int], recipe: Recipe, folder: Path) -> None:

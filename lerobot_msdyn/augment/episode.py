@@ -13,6 +13,7 @@ from torch import Tensor
 
 from lerobot_msdyn.augment.backgrounds import Backgrounds
 from lerobot_msdyn.augment.recorded import read_recorded
+from lerobot_msdyn.augment.shown import steps_with_sheet, write_frame
 from lerobot_msdyn.core.config import GateConfig, Recipe
 from lerobot_msdyn.core.errors import ConfigError, EpisodeError
 from lerobot_msdyn.core.observations import View
@@ -73,9 +74,10 @@ def augment_episode(
             logger.warning("%s episode %d, %s: %s", source.repo_id, index, key, "; ".join(noted[key].defects))
     other = _other_pose(recipe, index, episode.views[cameras[0]]) if cameras else None
     kept = output.episode(index)
-    scenes = {}
+    scenes, sheets = {}, {}
     for key, view in episode.views.items():
         progress(f"episode {index}: fitting {key}", 0.0)
+        sheets[key] = kept.folder / f"priors_{key}.jpg"
         make_scene = functools.partial(
             reconstruct,
             view,
@@ -85,6 +87,7 @@ def augment_episode(
             others=[other for name, other in episode.views.items() if name != key],
             episode=index,
             key=key,
+            steps=steps_with_sheet(sheets[key], key, source.fps),
         )
         scenes[key] = kept.keep(f"{SCENE}_{key}", make_scene)
     ready = {key: on_device(scene, chosen_device(recipe.device)) for key, scene in scenes.items()}
@@ -97,7 +100,7 @@ def augment_episode(
     for variant in range(recipe.variants if cameras else 0):
         progress(f"episode {index}: rendering variant {variant}", 0.0)
         make_episode = functools.partial(_rendered, source, index, variant, recipe, output, ready, noted, other)
-        new.append(kept.keep(f"variant_{variant:02d}", make_episode))
+        new.append(replace(kept.keep(f"variant_{variant:02d}", make_episode), sheets=sheets))
         progress("", 0.5 / recipe.variants)
     if recipe.save_scenes:
         for key, scene in scenes.items():
@@ -117,7 +120,7 @@ def _rendered(
     noted: Mapping[str, Noted],
     other: Tensor | None,
 ) -> NewEpisode:
-    """One new episode, rendered and encoded; nothing is rendered of one that was dropped."""
+    """One new episode, rendered and encoded; of one that is dropped a single frame is kept, for the report."""
     start = time.perf_counter()
     chosen, gate, dropped = _accepted(scenes, recipe, index, variant, other)
     for key, view in gate["views"].items():
@@ -129,7 +132,12 @@ def _rendered(
     new = _staged(source, index, variant, recipe, output, scenes, chosen, gate, flashes, dropped=dropped)
     if recipe.gate.enabled and not dropped:
         new = _without_flashes(new, flashes, noted, recipe.gate)
-    return replace(new, seconds=seconds)
+    frames = {}
+    if new.dropped:
+        frames = {key: output.episode(index).folder / f"dropped_{variant:02d}_{key}.jpg" for key in scenes}
+        for key, path in frames.items():
+            write_frame(path, scenes[key], chosen.cameras[key], recipe.fill)
+    return replace(new, seconds=seconds, frames=frames)
 
 
 def _without_flashes(new: NewEpisode, flashes: Flashes, noted: Mapping[str, Noted], config: GateConfig) -> NewEpisode:

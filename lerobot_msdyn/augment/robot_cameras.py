@@ -146,7 +146,7 @@ def calibrated[R: Recipe](
         except (ConfigError, DatasetError, PriorError) as error:
             if isinstance(error, ConfigError) and (config.robot.urdf is not None or config.robot.name):
                 raise
-            logger.info("cameras are not found by the robot's joints: %s", error)
+            logger.info("the robot's joints are not used to locate cameras: %s", error)
             return config
         for name, where, place in found.named():
             text = f"not used, {place.doubt}" if place.verdict is None or place.doubt else summary(place.verdict)

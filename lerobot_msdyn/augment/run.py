@@ -3,29 +3,23 @@
 import contextlib
 import functools
 import logging
-import sys
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from dataclasses import replace
 
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
-from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from lerobot_msdyn.augment.assumed_depth import say_assumed_depth
 from lerobot_msdyn.augment.backgrounds import background_episodes
 from lerobot_msdyn.augment.config import AugmentConfig
-from lerobot_msdyn.augment.cost import (
-    first_speeds,
-    predicted_output_bytes,
-    predicted_scene_bytes,
-    predicted_seconds,
-)
 from lerobot_msdyn.augment.episode import augment_episode
 from lerobot_msdyn.augment.failures import same_reason
+from lerobot_msdyn.augment.plan import camera_lines
+from lerobot_msdyn.augment.progress import EpisodeBar
 from lerobot_msdyn.augment.robot_cameras import calibrated
 from lerobot_msdyn.augment.run_identity import source_folder
-from lerobot_msdyn.augment.workers import Work, Workers, terse, threads_of_one, workers_for
+from lerobot_msdyn.augment.workers import Work, Workers, workers_for
 from lerobot_msdyn.core.errors import EpisodeError, MsdynError
 from lerobot_msdyn.dataset.convert import named_as_given
 from lerobot_msdyn.dataset.provenance import CALIBRATION
@@ -34,9 +28,6 @@ from lerobot_msdyn.dataset.write import NewEpisode, OutputDataset
 from lerobot_msdyn.render.devices import chosen_device
 
 logger = logging.getLogger(__name__)
-
-FORESEEN = 0.05  # share of the work after which what is left can be told
-UNWATCHED_S = 30.0  # between updates of a progress bar that nobody watches
 
 
 def prepared(
@@ -76,20 +67,14 @@ def run_local(
     config, problems = prepared(source, episodes, cameras, config, output)
     failures: dict[int, str] = {}
     reasons: set[str] = set()
-    bar_format = "{desc} |{bar}| {percentage:3.0f} % of {total} episodes [{elapsed}"
-    watched = sys.stderr.isatty()  # in a file a bar has a line per update
-    interval_s = 0.1 if watched else UNWATCHED_S
-    plain = functools.partial(tqdm, bar_format=f"{bar_format}]", mininterval=interval_s, smoothing=0)
-    with logging_redirect_tqdm(), plain(total=len(episodes)) as bar:
+    with logging_redirect_tqdm(), EpisodeBar(len(episodes)) as bar:
 
         def progress(what: str, share: float) -> None:
             if what:
-                bar.set_description_str(what, refresh=watched)
-            bar.update(min(share, len(episodes) - bar.n))  # shares add up to one only up to rounding
-            if bar.n >= FORESEEN * len(episodes):
-                bar.bar_format = f"{bar_format}<{{remaining}}]"
+                bar.begin(what)
+            bar.advance(share)
 
-        bar.set_description_str("looking at the background", refresh=watched)
+        bar.begin("looking at the background")
         work = Work(source, cameras, config, output, progress)
         for index, failure in attempts(work, episodes, problems):
             if failure is None:
@@ -99,7 +84,7 @@ def run_local(
             if reason not in reasons:
                 reasons.add(reason)
                 logger.error("skipped: %s", failures[index])
-        bar.update(len(episodes) - bar.n)
+        bar.advance(len(episodes))
     return failures
 
 
@@ -175,32 +160,12 @@ def _make(work: Work, index: int) -> Callable[[], list[NewEpisode]]:
     )
 
 
-def plan(source: LeRobotDatasetMetadata, episodes: list[int], cameras: list[str], config: AugmentConfig) -> str:
-    """What a run would do: episodes, pictures, disk and time, the last by doing a little of it."""
-    frames = sum(int(source.episodes[index]["length"]) for index in episodes)
-    variants = config.variants if cameras else 0
-    copies = variants + int(config.include_source)
-    disk = predicted_output_bytes(source, episodes, config)
-    count = workers_for(config, frames, len(episodes))
-    with threads_of_one(count), terse(config):
-        speeds = first_speeds(source, episodes, cameras, config)
-    seconds = predicted_seconds(speeds, source, episodes, config, count)
-    scenes = predicted_scene_bytes(speeds, source, episodes, config) if config.save_scenes else 0.0
-    with_scenes = f", {scenes / 1e6:.0f} MB of it saved scenes" if scenes else ""
-    return (
-        f"{source.repo_id}: {len(episodes)} episodes, {frames} frames; re-rendering {', '.join(cameras) or 'nothing'}\n"
-        f"{variants} new per episode: {len(episodes) * copies} episodes, {frames * copies} frames, "
-        f"{frames * variants * len(cameras)} new pictures\n"
-        f"about {(disk + scenes) / 1e6:.0f} MB on disk{with_scenes}, and about {seconds / 60:.1f} minutes "
-        f"on this machine, by {count} {'process' if count == 1 else 'processes'}, judging by a few frames and steps\n"
-    )
-
-
 def _say_what_is_assumed(source: LeRobotDatasetMetadata, cameras: list[str], config: AugmentConfig) -> None:
     """Once per run: what nobody measured."""
     if not cameras:
         return
-    logger.info("%s: re-rendering %s", source.repo_id, ", ".join(cameras))
+    for line in camera_lines(source, cameras, config):
+        logger.info("%s", line)
     if config.camera.calibration is None:
         logger.warning(
             "no calibration: cameras are taken as fixed, with a horizontal field of view of %g degrees "

@@ -8,12 +8,25 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from lerobot_msdyn.core.errors import OutputError
+from lerobot_msdyn.core.errors import DatasetError, OutputError
 
 DISK_FAULTS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG}
 BLOCK_BYTES = 1 << 20
 CACHE_VARIABLE = "LEROBOT_MSDYN_CACHE"
 DIGEST_BYTES = 16
+
+
+def check_root(root: Path) -> None:
+    """Whether a folder can be that of a LeRobot dataset.
+
+    Raises:
+        DatasetError: its first file is absent.
+    """
+    if not (root / "meta" / "info.json").exists():
+        raise DatasetError(
+            f"no dataset in {root}: {root / 'meta' / 'info.json'} is absent; "
+            "--root is the exact folder that holds meta/, data/ and videos/"
+        )
 
 
 @contextlib.contextmanager

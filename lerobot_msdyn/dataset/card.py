@@ -1,7 +1,9 @@
 """The dataset card of an output: that it is synthetic, from what, by which recipe, with which limits."""
 
 import json
+import statistics
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ from lerobot.datasets.utils import create_lerobot_dataset_card
 from lerobot_msdyn.core.errors import DatasetError
 from lerobot_msdyn.core.files import write_whole
 from lerobot_msdyn.dataset.checks import regular_file
-from lerobot_msdyn.dataset.provenance import RECIPE, SOURCE_VARIANT, read_provenance
+from lerobot_msdyn.dataset.provenance import PREVIEW, RECIPE, SOURCE_VARIANT, read_provenance
 
 CARD = "README.md"
 MAX_CARD_BYTES = 1 << 20
@@ -28,37 +30,48 @@ CITATION = """\
 }"""
 NO_LICENCE = "unknown"  # the Hub's word for it
 DESCRIPTION = """\
-**{rendered} of the {episodes} episodes of this dataset are synthetic.** Their pictures were not recorded: they were
-rendered by lerobot_msdyn {version} from Gaussian scenes that were fitted to recorded episodes, as seen from cameras
-that were moved. Actions, states and times are those of the recording.
+**{rendered} of the {episodes} episodes in this dataset are synthetic.** Their pictures were not recorded: Gaussian
+scenes were fitted to recorded episodes and rendered by lerobot_msdyn {version}, as seen from cameras that were moved.
+Actions, states, tasks and timestamps are those of the recordings.
+
+{preview}{quality}
+### Source
 
 {sources}
 
-`meta/msdyn/episodes.parquet` says for every episode from which recording it comes, which variant it is, and what was
-sampled for its camera; `meta/msdyn/recipe.yaml` is the recipe.{models}
+`meta/msdyn/episodes.parquet` says for every episode which recording it comes from, which variant it is, and how its
+camera was moved; `meta/msdyn/recipe.yaml` is the recipe.{models}
 
 ### Limits
 
 * What no frame of a recording shows is filled in from its surroundings.
 * Shadows belong to surfaces; where something hid the ground, its shadow is missing.
 * Fast and thin things come out ragged.
-* Cameras were taken as fixed. Without recorded depth the scene is a table plane with things on it.
-* A policy that is evaluated on rendered pictures is not evaluated on a camera.
+* Where depth was neither recorded nor measured, things stand on an assumed table plane.
+* A policy that is evaluated on rendered pictures has not been evaluated on a camera.
 
 ### Splitting for evaluation
 
-Episodes that were rendered from one recording show the same actions. Held out at random, or by LeRobot's own
-`--dataset.eval_split` alone, re-renders of training episodes end up in the evaluation. Split by recording:
+All episodes rendered from one recording share its actions. If episodes are held out at random, or by LeRobot's own
+`--dataset.eval_split` alone, re-renders of training episodes end up in the evaluation set. Split by recording instead:
 
 ```sh
 lerobot-train $(python -m lerobot_msdyn.split --root FOLDER) --dataset.repo_id={repo_id} --dataset.root=FOLDER ...
 ```
 
-### Recipe
+<details><summary>Recipe</summary>
 
 ```yaml
 {recipe}
 ```
+
+</details>
+"""
+PREVIEW_TEXT = """\
+![Recorded above, rendered below]({path})
+
+*Above: recorded. Below: the same moments, rendered from a moved camera; the view of median expected quality.*
+
 """
 
 
@@ -74,11 +87,14 @@ def card_arguments(root: Path, repo_id: str, licence: str | None = None) -> dict
     count = Counter(row["source_repo_id"] for row in rows)
     models = {name: terms for row in rows for name, terms in json.loads(row.get("licences") or "{}").items()}
     used = "".join(f"\n* {name}: {terms}" for name, terms in sorted(models.items()))
+    preview = PREVIEW_TEXT.format(path=PREVIEW.as_posix()) if (root / PREVIEW).is_file() else ""
     description = DESCRIPTION.format(
+        preview=preview,
+        quality=_quality(rendered),
         rendered=len(rendered),
         episodes=len(rows),
         version=", ".join(sorted({row["version"] for row in rows if row.get("version")})),
-        sources="\n".join(f"* {number} episodes from {name}" for name, number in sorted(count.items())),
+        sources="\n".join(f"* {number} episodes made from {name}" for name, number in sorted(count.items())),
         models=f" Models that took part, and their licences:\n{used}" if used else "",
         repo_id=repo_id,
         recipe=recipe,
@@ -91,6 +107,29 @@ def card_arguments(root: Path, repo_id: str, licence: str | None = None) -> dict
         "paper": PAPER,
         "citation_bibtex": CITATION,
     }
+
+
+def _quality(rendered: Sequence[Mapping[str, Any]]) -> str:
+    """What the gate expected of the new views, and where their depth came from, as Markdown."""
+    scores: list[float] = []
+    depths: Counter[str] = Counter()
+    for row in rendered:
+        views = json.loads(row.get("gate") or "{}").get("views", {})
+        scores += [view["scores"]["expected_db"] for view in views.values() if "scores" in view]
+        for priors in json.loads(row.get("priors") or "{}").values():
+            depth = priors.get("depth", {})
+            depths[depth.get("model") or depth.get("provider") or "unknown"] += 1
+    if not rendered:
+        return ""
+    first = rendered[0]["episode_index"]
+    of = f"Depth: {', '.join(depths)}." if depths else ""
+    said = "The new views were not judged."
+    if scores:
+        said = (
+            f"Expected PSNR of the new views, estimated without a true picture: {min(scores):.1f} dB at worst, "
+            f"{statistics.median(scores):.1f} dB in the median, {max(scores):.1f} dB at best (`report.html` has each)."
+        )
+    return f"### Quality\n\n{said} {of} The first rendered episode is number {first}.\n"
 
 
 def write_card(root: Path, repo_id: str, licence: str | None = None) -> None:

@@ -25,6 +25,7 @@ from lerobot_msdyn.core.files import write_whole
 FOLDER = Path("meta") / "msdyn"
 TABLE = FOLDER / "episodes.parquet"
 RECIPE = FOLDER / "recipe.yaml"
+PREVIEW = FOLDER / "preview.jpg"  # recorded and new moments of one view, for the card
 CALIBRATION = "calibration"  # in FOLDER: what the robot's joints say of the cameras
 AT_ONCE = 1000  # rows that are plain values before they are a table, which takes a tenth of the memory
 SOURCE_VARIANT = -1  # the variant of an episode that was copied, not rendered

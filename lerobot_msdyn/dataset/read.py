@@ -1,5 +1,6 @@
 """Read LeRobot episodes into plain tensors: pixels, cameras, recorded depth, state and action."""
 
+import difflib
 import io
 import itertools
 import logging
@@ -15,6 +16,7 @@ import numpy as np
 import PIL.Image
 import pyarrow as pa
 import torch
+from huggingface_hub import HfApi
 from jaxtyping import Float, UInt8
 from lerobot.configs import DepthEncoderConfig
 from lerobot.datasets import LeRobotDatasetMetadata
@@ -25,7 +27,7 @@ from torch import Tensor
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.config import CameraConfig
 from lerobot_msdyn.core.errors import DatasetError, EpisodeError, first_line
-from lerobot_msdyn.core.files import cache_folder
+from lerobot_msdyn.core.files import cache_folder, check_root
 from lerobot_msdyn.core.observations import RobotSeen, View
 from lerobot_msdyn.dataset.calibration import make_camera, read_robot
 from lerobot_msdyn.dataset.checks import IntactEpisodes, check_metadata, picture_size, read_json
@@ -48,6 +50,8 @@ logger = logging.getLogger(__name__)
 CODEBASE_VERSION = "v3.0"
 BLOCK_FRAMES = 128  # that are decoded at once
 MILLIMETRES = 1000.0
+HUB_TIMEOUT_S = 10
+INFO_PLACES = "*/*/meta/info.json"  # of the datasets in LeRobot's home
 
 
 @dataclass(frozen=True)
@@ -100,10 +104,7 @@ def open_source(
     folder = HF_LEROBOT_HOME / repo_id if root is None else root
     if not (folder / "meta" / "info.json").exists():
         if root is not None:
-            raise DatasetError(
-                f"no dataset in {root}: {root / 'meta' / 'info.json'} is absent; "
-                "--root is the exact folder that holds meta/, data/ and videos/"
-            )
+            check_root(root)
         folder = _from_hub(repo_id, folder)
     check_version(folder)
     intact = check_metadata(folder)
@@ -136,12 +137,21 @@ def _without_unfinished(repo_id: str, folder: Path, intact: IntactEpisodes) -> S
 def _from_hub(repo_id: str, folder: Path) -> Path:
     """Where LeRobot put a dataset that it downloaded."""
     try:
+        # LeRobot tries again and again, for minutes where the hub cannot be reached: asked once first
+        HfApi().dataset_info(repo_id, timeout=HUB_TIMEOUT_S)
         return LeRobotDatasetMetadata(repo_id).root
     except Exception as error:
+        near = difflib.get_close_matches(repo_id, _local_names(), n=1)
+        hint = f"did you mean {near[0]!r}? Else" if near else "if it lies elsewhere,"
         raise DatasetError(
             f"no dataset {repo_id!r}: not in {folder}, and the hub does not have it or cannot be reached "
-            f"({type(error).__name__}); give its folder with --root"
+            f"({type(error).__name__}); {hint} give its folder with --root"
         ) from error
+
+
+def _local_names() -> list[str]:
+    """Names of the datasets in LeRobot's home."""
+    return [path.parents[1].relative_to(HF_LEROBOT_HOME).as_posix() for path in HF_LEROBOT_HOME.glob(INFO_PLACES)]
 
 
 def check_version(root: Path) -> None:

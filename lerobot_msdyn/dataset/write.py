@@ -49,7 +49,10 @@ class NewEpisode:
     pictures: StagedPictures = field(default_factory=StagedPictures)  # none for a copy of the source's episode
     masks: Mapping[str, np.ndarray] = field(default_factory=dict)  # of what was never seen, see `write_unseen`
     dropped: str = ""  # why there is no such episode in the end: the gate's reason
-    seconds: Mapping[str, float] = field(default_factory=dict)  # what took how long, for the report
+    # For the report: what took how long; and pictures by camera: of the priors, and a frame of what was dropped.
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    sheets: Mapping[str, Path] = field(default_factory=dict)
+    frames: Mapping[str, Path] = field(default_factory=dict)
 
 
 class MadeEpisodes(Sequence):
@@ -255,8 +258,8 @@ class OutputDataset:
                     write_unseen(folder, number, episode.masks)
             if self.scenes.is_dir():
                 shutil.copytree(self.scenes, folder / store.FOLDER, copy_function=os.link)
-            write_card(folder, self.repo_id, licence_of(self.source.root))
             report(folder)
+            write_card(folder, self.repo_id, licence_of(self.source.root))
             if self.root.exists() and not self.replaces:
                 raise OutputError(f"{self.root} appeared while the dataset was made; it was left as it is")
             self.staging.publish(folder, self.root, skipped, keep=keep)

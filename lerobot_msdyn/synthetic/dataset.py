@@ -1,5 +1,6 @@
 """Synthetic scenes as a LeRobot v3.0 dataset, written through LeRobot's own recording API."""
 
+import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -105,6 +106,13 @@ def record(
             # one process: forking beside the ray-caster's threads can hang
             dataset.save_episode(parallel_encoding=False)
     dataset.finalize()
+    _remove_empty(root / "images")  # where LeRobot has kept frames until their videos were encoded
+
+
+def _remove_empty(folder: Path) -> None:
+    """Remove a folder if no file lies in it, at any depth."""
+    if folder.is_dir() and not any(path.is_file() for path in folder.rglob("*")):
+        shutil.rmtree(folder)
 
 
 def _frame(

@@ -1,6 +1,7 @@
 """The command line, end to end: what a user types, what comes out, and what is refused."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -83,14 +84,17 @@ def test_the_same_command_gives_the_same_pictures(desk: Path, augmented: Path, t
 def test_dry_run_writes_nothing(desk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("--repo", "local/desk", "--root", str(desk), "--new_root", str(tmp_path / "new"), "--dry_run") == 0
     printed = capsys.readouterr().out
-    assert "3 episodes, 36 frames" in printed
-    assert "2 new per episode: 9 episodes, 108 frames, 144 new pictures" in printed
+    assert "reads  3 episodes, 36 frames, of local/desk" in printed
+    assert f"writes 9 episodes, 108 frames, to {tmp_path / 'new'}" in printed
+    assert "for each that is read: the recorded one and 2 new; 144 new pictures" in printed
+    assert re.search(r"time +\d+ to \d+ (seconds|minutes) on this machine by one process", printed)
+    assert re.search(r"disk +\d+\.\d to \d+\.\d MB", printed)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_output_stands_beside_the_source_by_default(desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("--repo", "local/desk", "--root", str(desk), "--dry_run") == 0
-    assert f"would be written to {desk.parent / 'desk_msdyn'}" in capsys.readouterr().out
+    assert f"to {desk.parent / 'desk_msdyn'}\n" in capsys.readouterr().out
 
 
 def test_bad_input_is_one_line_and_exit_code_2(desk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,6 +10,8 @@ from lerobot_msdyn.augment.cost import (
     Speeds,
     first_speeds,
     measure_speeds,
+    predicted_bytes,
+    predicted_output_bytes,
     predicted_scene_bytes,
     predicted_seconds,
 )
@@ -56,6 +58,18 @@ def test_parts_are_added_up(desk: Path) -> None:
     assert two == pytest.approx(
         (1 + 0.5) * 3 * 12 * 1 + 0.5 * 12 * 0.3 * 2 + 50 * 3 + 12 * (1 + 2 + 2 * 4) + 2 * 60 * 3
     )
+
+
+def test_disk_is_that_of_the_new_videos(desk: Path) -> None:
+    """Recorded episodes keep their size; what is rendered has that of a few frames that were encoded."""
+    source, recipe = open_source("local/desk", desk), Recipe(variants=2)
+    front = "observation.images.front"
+    bytes_of_front = sum(path.stat().st_size for path in (desk / "videos" / front).rglob("*.mp4"))
+    speeds = Speeds(1.0, 2.0, 3.0, 4.0, video_bytes=5000.0, videos=(front,))
+    assert bytes_of_front > 0
+    expected = predicted_output_bytes(source, [0, 1, 2], recipe) - 2 * bytes_of_front + 2 * 36 * 5000
+    reports = predicted_bytes(speeds, source, [0, 1, 2], recipe) - expected
+    assert reports == pytest.approx(6 * cost.REPORT_BYTES)
 
 
 def test_saved_scenes_need_disk(desk: Path) -> None:

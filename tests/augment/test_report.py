@@ -93,7 +93,7 @@ def entry(episode: int = 0, **changes: Any) -> ViewEntry:
 
 
 def test_every_text_is_escaped() -> None:
-    pictures = Pictures("data:image/jpeg;base64,", "data:image/jpeg;base64,", 3, 2.0, None)
+    pictures = Pictures("data:image/jpeg;base64,", "data:image/jpeg;base64,", 3, 2.0, None, "", "")
     entries = [
         entry(camera=NASTY, amounts={NASTY: 1.0}, rejected=[NASTY], pictures=pictures),
         entry(camera=NASTY, rejected=[NASTY], dropped=True),
@@ -109,7 +109,7 @@ def test_a_dropped_view_says_why_and_a_redrawn_one_too() -> None:
     assert "Why it was dropped" in text
     assert "dropped: too dark" in text
     assert "episode 3: no video" in text
-    pictures = Pictures("", "", 1, 1.0, None)
+    pictures = Pictures("", "", 1, 1.0, None, "", "")
     assert "Sampled again, since" in page("ds", {}, [entry(rejected=["too dark"], pictures=pictures)], [])
 
 
@@ -128,7 +128,9 @@ def test_it_opens_with_what_is_good_and_what_would_make_the_rest_better() -> Non
         entry(**scored(12, "depth"), rejected=["dim"], dropped=True),
     ]
     assert summary(some).startswith("1 of 3 views good, 1 doubtful, 1 dropped: depth is a guess; lower --perturbation")
-    text = page("ds", {}, [dataclasses.replace(each, pictures=Pictures("", "", 1, 1.0, None)) for each in some], [])
+    text = page(
+        "ds", {}, [dataclasses.replace(each, pictures=Pictures("", "", 1, 1.0, None, "", "")) for each in some], []
+    )
     assert '<article class="good">' in text
     assert '<article class="doubtful">' in text
     assert "doubtful: 17.0 dB expected" in text
@@ -137,7 +139,7 @@ def test_it_opens_with_what_is_good_and_what_would_make_the_rest_better() -> Non
 
 def test_views_that_were_not_judged_are_shown_as_such() -> None:
     view = {"camera_from_source": np.eye(4).tolist(), "distance_m": 0.6, "what_moves": WHAT_MOVES}
-    text = page("ds", {}, [entry(view=view, pictures=Pictures("", "", 1, 1.0, None))], [])
+    text = page("ds", {}, [entry(view=view, pictures=Pictures("", "", 1, 1.0, None, "", ""))], [])
     assert "not judged" in text
     outline(text)
 

@@ -1,29 +1,35 @@
 """From a finished run to report.html beside its output.
 
-The page is bounded: pictures of at most PICTURED views (half of them the ones with the lowest scores), about 0.4 MB
-each, and page.LISTED rows of text.
+The page is bounded: pictures of at most PICTURED views (half of them the ones with the lowest scores), about 0.5 MB
+each, of as many dropped ones, MOST_SHEETS sheets of priors, and page.LISTED rows of text.
 """
 
+import importlib.metadata
 import logging
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import cv2
 import numpy as np
 from lerobot.datasets import LeRobotDatasetMetadata
 
-from lerobot_msdyn.augment.report.page import LISTED, Pictures, ViewEntry, page
+from lerobot_msdyn.augment.report.page import LISTED, Origin, Pictures, ViewEntry, page, worst_first
 from lerobot_msdyn.augment.report.pictures import (
     CLIP_FRAMES,
     STRIP_FRAMES,
     data_url,
     film,
+    full_size,
     heat_map,
+    jpeg_url,
+    side_by_side,
     spread,
     strip,
 )
-from lerobot_msdyn.dataset.provenance import CALIBRATION, FOLDER, SOURCE_VARIANT
+from lerobot_msdyn.augment.shown import write_jpeg
+from lerobot_msdyn.dataset.provenance import CALIBRATION, FOLDER, PREVIEW, RECIPE, SOURCE_VARIANT
 from lerobot_msdyn.dataset.read import open_source, read_colour
 from lerobot_msdyn.dataset.rows import read_rows
 from lerobot_msdyn.dataset.write import NewEpisode
@@ -31,8 +37,10 @@ from lerobot_msdyn.dataset.write import NewEpisode
 logger = logging.getLogger(__name__)
 
 NAME = "report.html"
+PACKAGES = {"lerobot_msdyn": "lerobot_msdyn", "LeRobot": "lerobot"}
 PICTURED = 16  # views with pictures
 MOST_LINKS = 6  # pictures of a robot's links
+MOST_SHEETS = 3  # of priors, of the views with the lowest scores
 
 
 def write_report(
@@ -55,19 +63,84 @@ def write_report(
         skipped_episodes: how many were.
         seconds: what the run took.
     """
-    entries = [_without_details(entry) for entry, _ in entries_of(episodes)]
+    entries: list[ViewEntry] = []
+    places: dict[int, int] = {}  # of those that were kept, the episode of the output
+    for entry, index in entries_of(episodes):
+        if index is not None:
+            places[len(entries)] = index
+        entries.append(_without_details(entry))
     output = open_source(source.repo_id, root)
     pictured = _pictured(entries)
     dropped = set([i for i, entry in enumerate(entries) if entry.dropped][:LISTED])
-    for i, (entry, index) in enumerate(entries_of(episodes)):
-        if i in pictured and index is not None:
-            entries[i] = replace(entry, pictures=_pictures(source, output, index, entry))
+    for i, (entry, _) in enumerate(entries_of(episodes)):
+        if i in pictured:
+            entries[i] = replace(entry, pictures=_pictures(source, output, places[i], entry))
         elif i in dropped:
             entries[i] = entry
+    for i in [i for i, entry in enumerate(entries) if entry.frame is not None][:PICTURED]:
+        entries[i] = replace(entries[i], pair=_dropped_pair(source, entries[i]))
+    _write_preview(source, output, root, entries, places)
     path = root / NAME
-    figures, links = _figures(episodes, entries, skipped_episodes, seconds), _links(root)
-    path.write_text(page(name, figures, entries, skipped, links), encoding="utf-8")
+    figures = _figures(episodes, entries, skipped_episodes, seconds)
+    origin = Origin(_facts(source, episodes), _recipe(root), _sheets(entries), _links(root))
+    path.write_text(page(name, figures, entries, skipped, origin), encoding="utf-8")
     return path
+
+
+def _write_preview(
+    source: LeRobotDatasetMetadata,
+    output: LeRobotDatasetMetadata,
+    root: Path,
+    entries: Sequence[ViewEntry],
+    places: Mapping[int, int],
+) -> None:
+    """The picture of the dataset card: the view of median score."""
+    ranked = sorted(places, key=lambda i: entries[i].score)
+    if ranked:
+        middle = ranked[len(ranked) // 2]
+        before, after = _recorded_and_new(source, output, places[middle], entries[middle])
+        few = spread(len(before), STRIP_FRAMES)
+        write_jpeg(root / PREVIEW, strip(list(before[few]), list(after[few])))
+
+
+def _facts(source: LeRobotDatasetMetadata, episodes: Iterable[NewEpisode]) -> dict[str, str]:
+    """What to say of how they were made."""
+    depths: dict[str, None] = {}
+    for episode in episodes:
+        if episode.provenance.variant != SOURCE_VARIANT:
+            for camera, priors in episode.provenance.priors.items():
+                depth = priors.get("depth", {})
+                why = f" ({depth['why']})" if depth.get("why") else ""
+                depths[f"{camera}: {depth.get('model', depth.get('provider', 'unknown'))}{why}"] = None
+    versions = [f"{title} {importlib.metadata.version(name)}" for title, name in PACKAGES.items()]
+    return {
+        "source": f"{source.repo_id}, {source.total_episodes} episodes, {source.total_frames} frames",
+        "depth": "; ".join(depths),
+        "made": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC, by {', '.join(versions)}",
+    }
+
+
+def _recipe(root: Path) -> str:
+    path = root / RECIPE
+    return path.read_text(encoding="utf-8") if path.is_file() else ""
+
+
+def _sheets(entries: Sequence[ViewEntry]) -> dict[str, str]:
+    """Pictures of the priors of the episodes whose views are worst, by what they are of."""
+    worst = [entry for entry in worst_first(entries) if entry.sheet is not None]
+    paths = {f"episode {entry.episode}, {entry.camera}": entry.sheet for entry in worst}
+    shown = [(name, path) for name, path in paths.items() if path is not None and path.is_file()][:MOST_SHEETS]
+    return {name: jpeg_url(path.read_bytes()) for name, path in shown}
+
+
+def _dropped_pair(source: LeRobotDatasetMetadata, entry: ViewEntry) -> str | None:
+    """The frame that was rendered of a dropped view, beside the recorded one."""
+    after = None if entry.frame is None else cv2.imread(str(entry.frame))
+    if after is None:
+        return None
+    rows = read_rows(source, entry.episode)
+    before = read_colour(source, entry.episode, entry.camera, rows, [len(rows) // 2])[0].numpy()
+    return data_url(side_by_side(before, after[..., ::-1]))
 
 
 def _links(root: Path) -> dict[str, str]:
@@ -87,7 +160,17 @@ def entries_of(episodes: Iterable[NewEpisode]) -> Iterator[tuple[ViewEntry, int 
                 amounts, rejected = origin.perturbation[camera], origin.gate["rejected"]
                 view = view | origin.views[camera]
                 dropped = bool(episode.dropped)
-                entry = ViewEntry(episode.source_index, origin.variant, camera, amounts, view, rejected, dropped)
+                entry = ViewEntry(
+                    episode.source_index,
+                    origin.variant,
+                    camera,
+                    amounts,
+                    view,
+                    rejected,
+                    dropped,
+                    sheet=episode.sheets.get(camera),
+                    frame=episode.frames.get(camera),
+                )
                 yield entry, None if dropped else index
         index += not episode.dropped
 
@@ -108,21 +191,32 @@ def _pictured(entries: Sequence[ViewEntry]) -> set[int]:
 
 def _pictures(source: LeRobotDatasetMetadata, output: LeRobotDatasetMetadata, index: int, entry: ViewEntry) -> Pictures:
     """Strip, clip and map of one view, from the two datasets' own pictures."""
-    before, after = (
-        read_colour(meta, number, entry.camera, read_rows(meta, number)).numpy()
-        for meta, number in ((source, entry.episode), (output, index))
-    )
+    before, after = _recorded_and_new(source, output, index, entry)
     few, many = (spread(len(before), count) for count in (STRIP_FRAMES, CLIP_FRAMES))
     moving = film(list(before[many]), list(after[many]))
     scores = entry.view.get("scores")
-    heat = None if scores is None else data_url(heat_map(after[len(after) // 2], scores["heat"]))
+    middle = len(after) // 2
+    heat = None if scores is None else data_url(heat_map(after[middle], scores["heat"]))
     return Pictures(
         data_url(strip(list(before[few]), list(after[few]))),
         data_url(moving),
         len(many),
         moving.shape[1] / len(many) / moving.shape[0],
         heat,
+        data_url(full_size(before[middle])),
+        data_url(full_size(after[middle])),
     )
+
+
+def _recorded_and_new(
+    source: LeRobotDatasetMetadata, output: LeRobotDatasetMetadata, index: int, entry: ViewEntry
+) -> tuple[np.ndarray, np.ndarray]:
+    """All frames [t,h,w,3] of a view that was kept, recorded and new."""
+    recorded, new = (
+        read_colour(meta, number, entry.camera, read_rows(meta, number)).numpy()
+        for meta, number in ((source, entry.episode), (output, index))
+    )
+    return recorded, new
 
 
 def _figures(

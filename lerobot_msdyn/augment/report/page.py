@@ -3,7 +3,8 @@
 import html
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from lerobot_msdyn.augment.report.drawing import cameras_from_above
@@ -38,13 +39,20 @@ img,svg{display:block;width:100%;height:auto;border-radius:4px}
 .film{width:100%;background-size:calc(100% * var(--frames)) 100%;border-radius:4px;
 animation:film calc(var(--frames) * .16s) steps(var(--frames),jump-none) infinite}
 @keyframes film{from{background-position:0 0}to{background-position:100% 0}}
-@media (prefers-reduced-motion:reduce){.film{animation:none}}
+@media (prefers-reduced-motion:reduce){.film,.turns .other{animation:none}.turns:hover .other{opacity:0}}
 svg{background:var(--back);max-width:320px}
 .why{margin:12px 0 0}
 svg .recorded{fill:#8b95a3;stroke:#8b95a3}svg .new{fill:var(--new);stroke:var(--new)}
 svg polygon.recorded{fill:none;stroke-width:2}
 svg .sight{stroke-width:1;stroke-dasharray:3 4;opacity:.6}svg .target{fill:none;stroke:var(--ink);stroke-width:1.5}
-.scroll{overflow-x:auto}
+.scroll{overflow-x:auto}.sheet img{min-width:640px}
+.pair{display:grid;grid-template-columns:1fr 1fr;gap:8px;margin-top:8px}
+.pair div,.turns div{aspect-ratio:var(--ratio);background-size:100% 100%;border-radius:4px}
+.one{background-image:var(--one)}.other{background-image:var(--other)}
+.turns{display:grid;max-width:960px;margin-top:8px}.turns div{grid-area:1/1}
+.turns .other{animation:turns 1.6s steps(1) infinite}
+@keyframes turns{50%{opacity:0}}
+pre{overflow-x:auto;font-size:13px}
 table{border-collapse:collapse;width:100%;font-size:14px;background:var(--paper)}
 th,td{text-align:left;padding:6px 10px;border-bottom:1px solid var(--line);white-space:nowrap}
 td.text{white-space:normal;min-width:220px;overflow-wrap:anywhere}
@@ -57,6 +65,12 @@ details{margin-top:12px}summary{cursor:pointer;color:var(--soft)}
 @media (max-width:760px){main{padding:16px 12px 40px}h1{font-size:22px}.grid{grid-template-columns:1fr 1fr}
 .grid figure:first-child{grid-column:span 2}article{padding:12px}}
 """
+MEANING = (
+    "Recorded pictures are on the left and above, rendered ones on the right and below. Expected quality is an "
+    "estimate, since no camera stood where the new one does: how close a rendered picture comes to the one that it "
+    f"would have recorded, as PSNR in dB (more is better). A view is called good from {GOOD_DB:.0f} dB on; look at the "
+    "others before you train on them. Depth that is wrong in the same way in all frames is not noticed."
+)
 ADVICE_FOR = ("doubtful", "dropped")
 # Cause of most of the expected error of those views -> what to do.
 ADVICE = {
@@ -93,6 +107,8 @@ class Pictures:
     film_frames: int
     ratio: float  # width by height of one step of the film
     heat: str | None
+    one: str  # the frame in the middle at full size, recorded ...
+    other: str  # ... and new
 
 
 @dataclass(frozen=True)
@@ -107,6 +123,9 @@ class ViewEntry:
     rejected: list[str]  # reasons of the samples before
     dropped: bool
     pictures: Pictures | None = None
+    pair: str | None = None  # of a dropped view: a frame of it beside the recorded one, as a data URL
+    sheet: Path | None = None  # the priors of its episode
+    frame: Path | None = None  # of a dropped view
 
     @property
     def scores(self) -> dict[str, Any] | None:
@@ -128,12 +147,22 @@ class ViewEntry:
         return "good" if self.score >= GOOD_DB else "doubtful"
 
 
+@dataclass(frozen=True)
+class Origin:
+    """What a dataset was made of, and how."""
+
+    facts: Mapping[str, str] = field(default_factory=dict)  # by name: source, date, versions, depth
+    recipe: str = ""  # YAML
+    sheets: Mapping[str, str] = field(default_factory=dict)  # pictures of priors, as data URLs, by what they are of
+    links: Mapping[str, str] = field(default_factory=dict)  # the same of a robot's links over the video
+
+
 def page(
     title: str,
     figures: dict[str, str],
     entries: Sequence[ViewEntry],
     skipped: Sequence[str],
-    links: Mapping[str, str] | None = None,
+    origin: Origin = Origin(),
 ) -> str:
     """The whole report.
 
@@ -142,9 +171,9 @@ def page(
         figures: what to say at the top, by name.
         entries: all views; those with pictures are shown at length.
         skipped: why source episodes were left out, one line per reason.
-        links: pictures of the robot's links over the video, by name.
+        origin: what the dataset was made of.
     """
-    shown = [entry for entry in entries if entry.pictures is not None or entry.dropped]
+    shown = [entry for entry in worst_first(entries) if entry.pictures is not None or entry.dropped]
     top = "".join(f"<div><b>{text(value)}</b>{text(name)}</div>" for name, value in figures.items())
     left_out = ""
     if skipped:
@@ -164,13 +193,18 @@ def page(
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
         f"<title>{text(title)}</title><style>{STYLE}</style></head><body><main>"
         f'<h1>{text(title)}</h1><p class="lead">{text(summary(entries))}</p>'
-        '<p class="soft">Left and above: recorded. Right and below: rendered from the new camera. Scores are '
-        "estimates: no true picture of the new views exists.</p>"
-        f'<div class="figures">{top}</div>{left_out}<h2>What moves</h2>{moves}{_cameras(entries)}{_links(links or {})}'
-        f"<h2>Views</h2>{''.join(_article(entry) for entry in shown[:LISTED])}"
+        f'<p class="soft">{text(MEANING)}</p>'
+        f'<div class="figures">{top}</div>{left_out}'
+        f"<h2>Views, worst first</h2>{''.join(_article(entry) for entry in shown[:LISTED])}"
         f'<h2>All views</h2><div class="scroll">{_table(entries[:LISTED])}</div>{rest}'
+        f"<h2>What moves</h2>{moves}{_cameras(entries)}{_sheets(origin.sheets)}{_links(origin.links)}{_origin(origin)}"
         "</main></body></html>\n"
     )
+
+
+def worst_first(entries: Iterable[ViewEntry]) -> list[ViewEntry]:
+    """The views in the order in which to look at them: dropped ones, then by their scores."""
+    return sorted(entries, key=lambda entry: (not entry.dropped, entry.score))
 
 
 def summary(entries: Sequence[ViewEntry]) -> str:
@@ -220,14 +254,37 @@ def _cameras(entries: Sequence[ViewEntry]) -> str:
     lines = camera_lines(entries)
     more = [f"{len(lines) - LISTED} more are in meta/msdyn/episodes.parquet"] if len(lines) > LISTED else []
     what = bullets(lines[:LISTED] + more) if lines else "<p>They keep still.</p>"
-    return f"<h2>Recorded cameras (px of 320)</h2>{what}"
+    return f"<h2>Did the recorded cameras move? (px, at a width of 320)</h2>{what}"
+
+
+def _sheets(pictures: Mapping[str, str]) -> str:
+    if not pictures:
+        return ""
+    shown = "".join(
+        f'<p>{text(name)}</p><div class="scroll sheet"><img src="{url}" alt="priors of {text(name)}"></div>'
+        for name, url in pictures.items()
+    )
+    return (
+        '<h2>What was estimated from the recording</h2><p class="soft">Over time: the picture, what moves, depth, and '
+        f"the tracks of what moves. Where one of these is wrong, so are the new views.</p>{shown}"
+    )
+
+
+def _origin(origin: Origin) -> str:
+    if not origin.facts:
+        return ""
+    facts = "".join(
+        f"<tr><th>{text(name)}</th><td class=text>{text(fact)}</td></tr>" for name, fact in origin.facts.items()
+    )
+    recipe = f"<details><summary>Recipe</summary><pre>{text(origin.recipe)}</pre></details>" if origin.recipe else ""
+    return f'<h2>How it was made</h2><div class="scroll"><table>{facts}</table></div>{recipe}'
 
 
 def _links(pictures: Mapping[str, str]) -> str:
     if not pictures:
         return ""
     shown = "".join(f'<p>{text(name)}</p><img src="{url}" alt="{text(name)}">' for name, url in pictures.items())
-    return f"<h2>The robot's links by its joints</h2>{shown}"
+    return f"<h2>Where the joints say that the robot is</h2>{shown}"
 
 
 def text(value: object) -> str:
@@ -262,7 +319,13 @@ def _pictures(entry: ViewEntry) -> str:
     )
     pictures = entry.pictures
     if pictures is None:
-        return f'<div class="grid">{above}</div>'
+        pair = ""
+        if entry.pair:
+            pair = (
+                f'<figure><img src="{entry.pair}" alt="recorded left, new right">'
+                "<figcaption>A frame of it: recorded left, new right</figcaption></figure>"
+            )
+        return f'<div class="grid">{pair}{above}</div>'
     heat = ""
     if pictures.heat:
         heat = (
@@ -275,6 +338,12 @@ def _pictures(entry: ViewEntry) -> str:
         f'style="--frames:{pictures.film_frames};aspect-ratio:{pictures.ratio:.4f};'
         f"background-image:url('{pictures.film}')\"></div>"
         f"<figcaption>Recorded left, new right</figcaption></figure>{heat}{above}</div>"
+        f"<details style=\"--ratio:{pictures.ratio / 2:.4f};--one:url('{pictures.one}');"
+        f"--other:url('{pictures.other}')\">"
+        "<summary>Full size: recorded and new in turn, and side by side</summary>"
+        '<div class="turns" role="img" aria-label="recorded and new in turn"><div class="one"></div>'
+        '<div class="other"></div></div><div class="pair" role="img" aria-label="recorded left, new right">'
+        '<div class="one"></div><div class="other"></div></div></details>'
     )
 
 

@@ -14,6 +14,7 @@ CLIP_FRAMES = 12
 STRIP_FRAMES = 5
 CLIP_WIDTH = 240  # px, of one picture
 STRIP_WIDTH = 224  # px
+FULL_WIDTH = 960  # px, at most
 JPEG_QUALITY = 72
 GAP_PX = 4
 PAPER = 255
@@ -23,7 +24,12 @@ def data_url(picture: UInt8[ndarray, "h w 3"]) -> str:
     """A picture as a JPEG inside a URL."""
     settings = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
     content = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), settings)[1]
-    return "data:image/jpeg;base64," + base64.b64encode(content.tobytes()).decode("ascii")
+    return jpeg_url(content.tobytes())
+
+
+def jpeg_url(content: bytes) -> str:
+    """The bytes of a JPEG inside a URL."""
+    return "data:image/jpeg;base64," + base64.b64encode(content).decode("ascii")
 
 
 def spread(total: int, count: int) -> Int[ndarray, " n"]:
@@ -45,6 +51,16 @@ def film(before: Sequence[ndarray], after: Sequence[ndarray]) -> UInt8[ndarray, 
         for one, other in zip(before, after, strict=True)
     ]
     return np.concatenate(pairs, axis=1)
+
+
+def full_size(picture: UInt8[ndarray, "h w 3"]) -> UInt8[ndarray, "height width 3"]:
+    """A picture as it is, but for very wide ones."""
+    return _narrowed(picture, min(picture.shape[1], FULL_WIDTH))
+
+
+def side_by_side(before: UInt8[ndarray, "h w 3"], after: UInt8[ndarray, "h w 3"]) -> UInt8[ndarray, "height width 3"]:
+    """A recorded picture and a new one of its size."""
+    return _beside([_narrowed(picture, min(picture.shape[1], CLIP_WIDTH * 2)) for picture in (before, after)])
 
 
 def heat_map(picture: UInt8[ndarray, "h w 3"], percent: Sequence[Sequence[int]]) -> UInt8[ndarray, "height width 3"]:

@@ -1,0 +1,31 @@
+"""The progress bar of a run: what is being done, the share of the episodes that is done, and the time that is left."""
+
+import sys
+from io import TextIOBase
+from typing import Any
+
+from tqdm import tqdm
+
+FORESEEN = 0.05  # share of the work after which what is left can be told
+UNWATCHED_S = 30.0  # between updates of a bar that nobody watches: in a file each is a line
+FORMAT = "{desc} |{bar}| {percentage:3.0f} % of {total} episodes [{elapsed}"
+
+
+class EpisodeBar(tqdm):
+    """Counts episodes, in parts; tells the time left by the average, once enough is done. Use as a context."""
+
+    def __init__(self, total: int, stream: TextIOBase | None = None) -> None:
+        file: Any = sys.stderr if stream is None else stream
+        self._watched, self._episodes = file.isatty(), total
+        interval_s = 0.1 if self._watched else UNWATCHED_S
+        super().__init__(total=total, file=file, bar_format=f"{FORMAT}]", mininterval=interval_s, smoothing=0)
+
+    def begin(self, what: str) -> None:
+        """Say what is being done now."""
+        self.set_description_str(what, refresh=self._watched)
+
+    def advance(self, share: float) -> None:
+        """Some share of an episode is done."""
+        self.update(min(share, self._episodes - self.n))  # shares add up to one only up to rounding
+        if self.n >= FORESEEN * self._episodes:
+            self.bar_format = f"{FORMAT}<{{remaining}}]"
