@@ -25,6 +25,7 @@ from lerobot_msdyn.dataset.convert import named_as_given
 from lerobot_msdyn.dataset.provenance import CALIBRATION
 from lerobot_msdyn.dataset.rows import files_problem
 from lerobot_msdyn.dataset.write import NewEpisode, OutputDataset
+from lerobot_msdyn.priors.estimate import check_named_providers
 from lerobot_msdyn.render.devices import chosen_device
 
 logger = logging.getLogger(__name__)
@@ -42,6 +43,7 @@ def prepared(
     The second is why an episode cannot be read, by its number, as far as that is seen without opening its files.
     """
     chosen_device(config.device)  # complains, or says what is used, before anything is done
+    check_named_providers(config.priors, config.camera, config.device)
     problems = problems_of(source, episodes)
     whole = [index for index in episodes if index not in problems]
     if whole:

@@ -20,7 +20,7 @@ from lerobot_msdyn.priors.depth.lying import with_lying
 from lerobot_msdyn.priors.from_file import CameraFile, DepthFile, MaskFile, TrackFile
 from lerobot_msdyn.priors.masks.moving import instances_before
 from lerobot_msdyn.priors.masks.providers.change import CHANGE
-from lerobot_msdyn.priors.provide import provide
+from lerobot_msdyn.priors.provide import check_named, provide
 from lerobot_msdyn.priors.registry import CameraProvider, Depth, DepthProvider, MaskProvider, Masks, TrackProvider
 from lerobot_msdyn.priors.request import Request
 from lerobot_msdyn.priors.robot import with_robot, with_robot_depth
@@ -120,6 +120,20 @@ def _before_poses(request: Request, camera: CameraTrack, depth: Depth) -> Masks:
     poses = camera.world_from_camera, camera.intrinsics, depth.z
     settings = {"seen": [digest_of(part.contiguous().view(torch.uint8)) for part in poses]}
     return torch.from_numpy(request.cache.get("masks", "poses", settings, compute)["masks"])
+
+
+def check_named_providers(config: PriorsConfig, camera: CameraConfig, device: str = "auto") -> None:
+    """Whether the providers that settings name have what they need, before any video is read.
+
+    Raises:
+        ConfigError: there is no such provider, or the device cannot be used.
+        PriorError: one of them cannot be used.
+    """
+    networks_on = chosen_device(device, networks=True).type
+    check_named(MaskProvider, config.masks, config, networks_on)
+    check_named(CameraProvider, camera.poses, config, networks_on)
+    check_named(DepthProvider, config.depth, config, networks_on)
+    check_named(TrackProvider, config.tracks, config, networks_on)
 
 
 def _masks(request: Request) -> tuple[Masks, Origin]:

@@ -4,6 +4,7 @@ import inspect
 import logging
 from collections.abc import Callable
 
+from lerobot_msdyn.core.config import PriorsConfig
 from lerobot_msdyn.core.errors import ConfigError, PriorError
 from lerobot_msdyn.core.fields import AUTO, FILE, PARAMETER
 from lerobot_msdyn.core.observations import Origin
@@ -38,7 +39,22 @@ def provide[P: Provider, T](
         provider.usable(request)
         return _run(kind, name, provider, request, run, why)
     except Unusable as error:
-        raise PriorError(f"{kind.setting} is {wanted!r}, but {error}") from error
+        raise _cannot(kind, wanted, error) from error
+
+
+def check_named(kind: type[Provider], wanted: str, config: PriorsConfig, device: str) -> None:
+    """Whether a provider that is asked for by name has what it needs, as far as that is known without a video.
+
+    Raises:
+        ConfigError: there is no such provider.
+        PriorError: it has not.
+    """
+    if wanted == AUTO or wanted.endswith(FILE):
+        return
+    try:
+        _made(kind, wanted).check(config, device)
+    except Unusable as error:
+        raise _cannot(kind, wanted, error) from error
 
 
 def best[P: Provider, T](
@@ -76,6 +92,10 @@ def best[P: Provider, T](
             logger.warning("%s: %s cannot be used: %s", kind.prior, name, error)
             against.append(f"{name} cannot be used ({error})")
     raise PriorError(f"{kind.setting}: no provider can be used: {', '.join(against) or 'there is none'}")
+
+
+def _cannot(kind: type[Provider], wanted: str, error: Unusable) -> PriorError:
+    return PriorError(f"{kind.setting} is {wanted!r}, but {error}")
 
 
 def _run[P: Provider, T](

@@ -28,6 +28,7 @@ from torch import Tensor
 
 from lerobot_msdyn.core import registries
 from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.config import PriorsConfig
 from lerobot_msdyn.core.errors import PriorError
 from lerobot_msdyn.core.observations import DepthTraits, Model, PointTracks, View
 from lerobot_msdyn.core.registry import Registry
@@ -91,6 +92,18 @@ class Provider(ABC):
             Unusable: it cannot.
         """
         return ""
+
+    def check(self, config: PriorsConfig, device: str) -> None:
+        """Find out, before any video is read, what speaks against it; called where it is asked for by name.
+
+        Args:
+            config: the settings of priors.
+            device: on which networks run.
+
+        Raises:
+            PriorError: a file that it needs is absent or of no use.
+        """
+        return
 
     @staticmethod
     @abstractmethod

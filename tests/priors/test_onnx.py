@@ -17,6 +17,7 @@ from lerobot_msdyn.core.fields import problems
 from lerobot_msdyn.core.observations import Priors, View
 from lerobot_msdyn.priors import estimate_priors
 from lerobot_msdyn.priors.depth.onnx_spec import FAMILIES, family_of, read_spec
+from lerobot_msdyn.priors.estimate import check_named_providers
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 3
 
@@ -256,6 +257,19 @@ def test_a_wrong_choice_is_named_in_one_line(view: View, depth: str, message: st
     with pytest.raises(MsdynError, match=message) as caught:
         estimate(view, depth)
     assert "\n" not in str(caught.value)
+    with pytest.raises(MsdynError, match=message):
+        check_named_providers(PriorsConfig(depth=depth), CameraConfig(), "cpu")
+
+
+def test_what_is_wrong_with_a_network_is_known_before_any_video_is_read(networks, tmp_path: Path) -> None:
+    file = networks.save_network(tmp_path / "net.onnx", shape=(1, 3, HEIGHT, WIDTH))
+    config = PriorsConfig(depth=f"onnx:{file}", onnx={"kind": "metric"})
+    check_named_providers(config, CameraConfig(), "cpu")
+    with pytest.raises(PriorError, match="unknown key 'knd'"):
+        check_named_providers(replace(config, onnx={"knd": "metric"}), CameraConfig(), "cpu")
+    file.write_bytes(b"no network")
+    with pytest.raises(PriorError, match="is no network that onnxruntime can load"):
+        check_named_providers(config, CameraConfig(), "cpu")
 
 
 def test_only_names_of_the_registry_take_a_parameter() -> None:

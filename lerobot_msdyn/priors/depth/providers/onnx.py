@@ -6,6 +6,7 @@ from pathlib import Path
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from lerobot_msdyn.core.config import PriorsConfig
 from lerobot_msdyn.core.files import digest_of_file
 from lerobot_msdyn.core.observations import Model
 from lerobot_msdyn.priors.depth.metres import in_metres
@@ -27,12 +28,20 @@ class Onnx(DepthProvider):
     def __init__(self, file: str) -> None:
         self._file = Path(file).expanduser()
 
+    def check(self, config: PriorsConfig, device: str) -> None:
+        """The file is loaded, and what is stated of it is read."""
+        self._demand()
+        OnnxNetwork(self._file, read_spec(self._file, config.onnx)[0], device)
+
     def usable(self, request: Request) -> str:
         """The file and onnxruntime are there."""
+        self._demand()
+        return "its file is there"
+
+    def _demand(self) -> None:
         demand_library("onnxruntime", "onnx", "a network in a file of ONNX")
         if not self._file.is_file():
             raise Unusable(f"there is no file {self._file}", f"expected onnx:{self.parameter}")
-        return "its file is there"
 
     def estimate(self, request: Request, instances: Masks) -> Estimate[Depth]:
         """Aligned to the best depth that needs no network, where there is one in true metres or it has no scale."""
