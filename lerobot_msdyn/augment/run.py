@@ -86,7 +86,7 @@ def run_local(
             if reason not in reasons:
                 reasons.add(reason)
                 logger.error("skipped: %s", failures[index])
-        bar.advance(len(episodes))
+        bar.advance(float(len(episodes)))
     return failures
 
 

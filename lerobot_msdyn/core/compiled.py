@@ -1,10 +1,12 @@
 """Functions compiled by numba: one way to say so, which run-time checks of annotations do not get into."""
 
+import contextlib
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numba
+from numba.core import event
 
 
 def compiled(function: Callable, **options: Any) -> Any:
@@ -18,6 +20,13 @@ def compiled(function: Callable, **options: Any) -> Any:
 def inlined(function: Callable, **options: Any) -> Any:
     """Compiles a function that compiled ones call: a real call would copy the descriptors of all arrays."""
     return _compiled(function, forceinline=True, **options)
+
+
+@contextlib.contextmanager
+def time_spent_compiling() -> Iterator[Callable[[], float]]:
+    """Within, a function that says how many seconds have gone into compiling so far."""
+    with event.install_listener("numba:compile", event.TimingListener()) as listener:
+        yield lambda: listener.duration if listener.done else 0.0
 
 
 def _compiled(function: Callable, **options: Any) -> Any:
