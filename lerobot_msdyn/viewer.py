@@ -158,10 +158,15 @@ def show_episode(config: ViewerConfig, stream: "rr.RecordingStream") -> None:
     small = {key: view.shrunk(config.fit.max_width) for key, view in episode.views.items()}
     for key, view in episode.views.items():
         others = [other for name, other in small.items() if name != key]
+        if saved is None:
+            seen, scene = small[key], _reconstructed(config, source, index, key, episode.views)
+        else:
+            scene = store.load(saved[key])  # its camera may move
+            height, width = small[key].rgb.shape[1:3]
+            seen = replace(small[key], camera=scene.camera.resized(width, height))
         priors = estimate_priors(
-            small[key], config.priors, config.camera, others=others, episode=index, key=key, device=config.device
+            seen, config.priors, config.camera, others=others, episode=index, key=key, device=config.device
         )
-        scene = _reconstructed(config, source, index, key, episode.views) if saved is None else store.load(saved[key])
         log = _Log(stream, key.rsplit(".", 1)[-1], episode.fps)
         _log_source(log, view, priors)
         _log_gaussians(log, scene)

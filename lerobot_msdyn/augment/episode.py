@@ -125,6 +125,8 @@ def _rendered(
     chosen, gate, dropped = _accepted(scenes, recipe, index, variant, other)
     for key, view in gate["views"].items():
         view["camera"] = scenes[key].stands.entry() | {"displaced_px": noted[key].displaced_px}
+        if not scenes[key].camera.is_static:
+            view["camera"] |= {"stands": False, "path_m": round(scenes[key].camera.path_length, 3)}
         view["defects"] = noted[key].defects
     seconds = {"judging": round(time.perf_counter() - start, 1)}
     seconds |= {f"fitting {key}": round(scene.seconds["fit"], 1) for key, scene in scenes.items()}

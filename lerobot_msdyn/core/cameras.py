@@ -37,6 +37,12 @@ class CameraTrack:
             and (self.intrinsics == self.intrinsics[:1]).all()
         )
 
+    @property
+    def path_length(self) -> float:
+        """How far it goes from frame to frame, all in all; m."""
+        places = self.world_from_camera[:, :3, 3]
+        return float((places[1:] - places[:-1]).norm(dim=-1).sum())
+
     def select(self, frames: slice | list[int] | Tensor) -> "CameraTrack":
         """The camera at some of its frames."""
         return replace(self, intrinsics=self.intrinsics[frames], world_from_camera=self.world_from_camera[frames])

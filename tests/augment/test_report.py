@@ -171,12 +171,14 @@ def test_it_says_where_cameras_were_moved() -> None:
         seen(2, displaced_px=30.0),
         seen(3, displaced_px=30.1),
         seen(4, stands=False, drift_px=90.0),
+        seen(5, stands=False, path_m=0.314),
     ]
     assert camera_lines([*entries, *entries]) == [
         f"{FRONT}, episode 0: moved by 13.4 px before frame 12",
         f"{FRONT}, episode 1: drifts by 9.5 px",
         f"{FRONT}, episode 2: begins 30.0 px from where episode 0 does",
         f"{FRONT}, episode 4: it moves, by 90.0 px",
+        f"{FRONT}, episode 5: it moves along 0.31 m, by its poses",
     ]
     text = page("ds", {}, entries, [])
     assert "episode 0: moved by 13.4 px" in text

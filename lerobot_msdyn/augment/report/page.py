@@ -237,6 +237,9 @@ def camera_lines(entries: Iterable[ViewEntry]) -> list[str]:
     places: dict[str, float] = {}
     for (key, episode), camera in cameras.items():
         where = f"{key}, episode {episode}"
+        if "path_m" in camera:
+            lines.append(f"{where}: it moves along {camera['path_m']:.2f} m, by its poses")
+            continue
         if not camera["stands"]:
             lines.append(f"{where}: it moves, by {camera['drift_px']} px")
             continue
