@@ -38,6 +38,7 @@ logger = logging.getLogger(__name__)
 
 NAME = "report.html"
 PICTURED = 16  # views with pictures
+ASSUMED_PROVIDER = "plane"  # of depth
 MOST_LINKS = 6  # pictures of a robot's links
 MOST_SHEETS = 3  # of priors, of the views with the lowest scores
 
@@ -72,8 +73,7 @@ def write_report(
     _write_preview(source, output, root, entries, places)
     path = root / NAME
     figures = _figures(episodes, entries, skipped_episodes, seconds)
-    origin = Origin(_facts(source, root), _recipe(root), _sheets(entries), _links(root))
-    path.write_text(page(name, figures, entries, skipped, origin), encoding="utf-8")
+    path.write_text(page(name, figures, entries, skipped, _origin(source, root, entries)), encoding="utf-8")
     return path
 
 
@@ -93,21 +93,25 @@ def _write_preview(
         write_jpeg(root / PREVIEW, strip(list(before[few]), list(after[few])))
 
 
-def _facts(source: LeRobotDatasetMetadata, root: Path) -> dict[str, str]:
+def _origin(source: LeRobotDatasetMetadata, root: Path, entries: Sequence[ViewEntry]) -> Origin:
     """What to say of how the dataset in `root` was made."""
     rows = [row for row in read_provenance(root) or [] if row["variant"] != SOURCE_VARIANT]
-    depths: dict[str, None] = {}
-    for row in rows:
-        for camera, priors in json.loads(row["priors"]).items():
-            depth = priors.get("depth", {})
-            why = f" ({depth['why']})" if depth.get("why") else ""
-            depths[f"{camera}: {depth.get('model', depth.get('provider', 'unknown'))}{why}"] = None
+    depths = [(name, priors.get("depth", {})) for row in rows for name, priors in json.loads(row["priors"]).items()]
+    said = dict.fromkeys(f"{name}: {_source_of(depth)}" for name, depth in depths)
     versions = {f"lerobot_msdyn {row['version']}, LeRobot {row['lerobot_version']}" for row in rows}
-    return {
+    facts = {
         "source": f"{source.repo_id}, {source.total_episodes} episodes, {source.total_frames} frames",
-        "depth": "; ".join(depths),
+        "depth": "; ".join(said),
         "made": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC, by {', '.join(sorted(versions))}",
     }
+    assumed = any(depth.get("provider") == ASSUMED_PROVIDER for _, depth in depths)
+    return Origin(facts, assumed, _recipe(root), _sheets(entries), _links(root))
+
+
+def _source_of(prior: Mapping[str, str]) -> str:
+    """Where a prior is from, and why from there."""
+    why = f" ({prior['why']})" if prior.get("why") else ""
+    return f"{prior.get('model', prior.get('provider', 'unknown'))}{why}"
 
 
 def _recipe(root: Path) -> str:
