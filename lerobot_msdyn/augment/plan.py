@@ -16,7 +16,7 @@ from lerobot_msdyn.augment.cost import (
 from lerobot_msdyn.augment.workers import terse, threads_of_one, workers_for
 from lerobot_msdyn.dataset.select import colour_cameras, is_wrist_camera
 
-TIME_RANGE = (0.75, 1.5)  # of the predicted time; chosen, from few measured runs: a busy machine and new samples cost more
+TIME_RANGE = (0.75, 1.5)  # of the predicted time; chosen by hand, not measured over many runs
 DISK_RANGE = (0.8, 1.25)  # of the predicted size; likewise
 
 
