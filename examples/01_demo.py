@@ -51,7 +51,7 @@ def main() -> None:
     depth = [] if parser.parse_args().no_depth else ["--depth"]
     begin = time.perf_counter()
     shutil.rmtree(OUT, ignore_errors=True)
-    size = ["--episodes", "1", "--frames", "30", "--width", "320", "--height", "240"]
+    size = ["--episodes", "1", "--frames", "40", "--width", "320", "--height", "240"]
     run("lerobot_msdyn.synthetic", "--out", str(OUT / "desk"), "--kind", "push", *size, *depth)
     run("lerobot_msdyn.augment", "--repo", "local/desk", "--root", str(OUT / "desk"), "--recipe", "quick")
 

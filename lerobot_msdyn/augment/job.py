@@ -82,7 +82,7 @@ def finished_before(config: AugmentConfig, root: Path, new_root: Path) -> list[s
 
 def _is_finished(config: AugmentConfig, root: Path, new_root: Path) -> bool:
     try:
-        runs = {row.get("run") for row in read_provenance(new_root) or []}
+        runs = {row.get("run") for row in read_provenance(new_root, ("run",)) or []}
         return len(runs) == 1 and runs == {digest_of_run(describe(config, root))}
     except (DatasetError, OSError):  # nothing to compare: `check_place` says what is there
         return False

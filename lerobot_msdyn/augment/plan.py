@@ -16,8 +16,8 @@ from lerobot_msdyn.augment.cost import (
 from lerobot_msdyn.augment.workers import terse, threads_of_one, workers_for
 from lerobot_msdyn.dataset.select import colour_cameras, is_wrist_camera
 
-TIME_RANGE = (0.75, 1.5)  # of the predicted time; runs took .. to .. of it (benchmarks/notes/runs.md)
-DISK_RANGE = (0.8, 1.25)  # of the predicted size
+TIME_RANGE = (0.75, 1.5)  # of the predicted time; chosen by hand, not measured over many runs
+DISK_RANGE = (0.8, 1.25)  # of the predicted size; likewise
 
 
 def plan(

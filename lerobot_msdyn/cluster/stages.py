@@ -243,7 +243,7 @@ def _has_all(new_root: Path, run: str, finished: set[int]) -> bool:
     """
     if not new_root.exists():
         return False
-    rows = read_provenance(new_root) or []
+    rows = read_provenance(new_root, ("run",)) or []
     if {row.get("run") for row in rows} != {run}:
         raise OutputError(f"{new_root} exists already; remove it or choose another --new_repo_id or --new_root")
     return {row["source_episode"] for row in rows} >= finished

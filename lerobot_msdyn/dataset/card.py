@@ -3,7 +3,7 @@
 import json
 import statistics
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from lerobot.datasets.utils import create_lerobot_dataset_card
 from lerobot_msdyn.core.errors import DatasetError
 from lerobot_msdyn.core.files import write_whole
 from lerobot_msdyn.dataset.checks import regular_file
-from lerobot_msdyn.dataset.provenance import PREVIEW, RECIPE, SOURCE_VARIANT, read_provenance
+from lerobot_msdyn.dataset.provenance import PREVIEW, RECIPE, SOURCE_VARIANT, read_column, read_provenance
 
 CARD = "README.md"
 MAX_CARD_BYTES = 1 << 20
@@ -81,7 +81,7 @@ def card_arguments(root: Path, repo_id: str, licence: str | None = None) -> dict
     `LeRobotDataset(repo_id, root).push_to_hub(**card_arguments(root, repo_id))` uploads all of the folder, meta/msdyn
     included, and writes the card last. Without a licence, the one that the folder's card names is kept.
     """
-    rows = read_provenance(root) or []
+    rows = read_provenance(root, ("variant", "licences", "version")) or []
     recipe = (root / RECIPE).read_text().strip() if (root / RECIPE).is_file() else "(several; see the parts)"
     rendered = [row for row in rows if row["variant"] != SOURCE_VARIANT]
     count = Counter(row["source_repo_id"] for row in rows)
@@ -90,7 +90,7 @@ def card_arguments(root: Path, repo_id: str, licence: str | None = None) -> dict
     preview = PREVIEW_TEXT.format(path=PREVIEW.as_posix()) if (root / PREVIEW).is_file() else ""
     description = DESCRIPTION.format(
         preview=preview,
-        quality=_quality(rendered),
+        quality=_quality(root, [row["episode_index"] for row in rendered]),
         rendered=len(rendered),
         episodes=len(rows),
         version=", ".join(sorted({row["version"] for row in rows if row.get("version")})),
@@ -109,19 +109,22 @@ def card_arguments(root: Path, repo_id: str, licence: str | None = None) -> dict
     }
 
 
-def _quality(rendered: Sequence[Mapping[str, Any]]) -> str:
-    """What the gate expected of the new views, and where their depth came from, as Markdown."""
-    scores: list[float] = []
-    depths: Counter[str] = Counter()
-    for row in rendered:
-        views = json.loads(row.get("gate") or "{}").get("views", {})
-        scores += [view["scores"]["expected_db"] for view in views.values() if "scores" in view]
-        for priors in json.loads(row.get("priors") or "{}").values():
-            depth = priors.get("depth", {})
-            depths[depth.get("model") or depth.get("provider") or "unknown"] += 1
+def _quality(root: Path, rendered: Sequence[int]) -> str:
+    """What the gate expected of the new views, by the numbers of their episodes, and where their depth came from."""
     if not rendered:
         return ""
-    first = rendered[0]["episode_index"]
+    scores: list[float] = []
+    depths: Counter[str] = Counter()
+    new = frozenset(rendered)
+    columns = (read_column(root, name) for name in ("episode_index", "gate", "priors"))
+    for index, gate, priors in zip(*columns, strict=True):
+        if index in new:
+            views = json.loads(gate or "{}").get("views", {})
+            scores += [view["scores"]["expected_db"] for view in views.values() if "scores" in view]
+            for prior in json.loads(priors or "{}").values():
+                depth = prior.get("depth", {})
+                depths[depth.get("model") or depth.get("provider") or "unknown"] += 1
+    first = rendered[0]
     of = f"Depth: {', '.join(depths)}." if depths else ""
     said = "The new views were not judged."
     if scores:

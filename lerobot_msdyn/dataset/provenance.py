@@ -7,7 +7,7 @@ import hashlib
 import importlib.metadata
 import itertools
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ TABLE = FOLDER / "episodes.parquet"
 RECIPE = FOLDER / "recipe.yaml"
 PREVIEW = FOLDER / "preview.jpg"  # recorded and new moments of one view, for the card
 CALIBRATION = "calibration"  # in FOLDER: what the robot's joints say of the cameras
+CHECKED = ("episode_index", "source_repo_id", "source_episode")  # columns that every record has
 AT_ONCE = 1000  # rows that are plain values before they are a table, which takes a tenth of the memory
 SOURCE_VARIANT = -1  # the variant of an episode that was copied, not rendered
 SAME = 3e-6  # m, px, or of a matrix: poses are kept in single precision, and what differs by less is the same
@@ -142,8 +143,23 @@ def _compressed(table: pa.Table) -> pa.Buffer:
     return buffer.getvalue()
 
 
-def read_provenance(root: Path) -> list[dict[str, Any]] | None:
+def read_column(root: Path, name: str) -> Iterator[Any]:
+    """One column of meta/msdyn/episodes.parquet, or None for each row where it has none.
+
+    It is read in parts, since scores of thousands of views take much memory.
+    """
+    with pq.ParquetFile(root / TABLE) as file:
+        if name not in file.schema_arrow.names:
+            yield from itertools.repeat(None, file.metadata.num_rows)
+            return
+        for batch in file.iter_batches(AT_ONCE, columns=[name]):
+            yield from batch[name].to_pylist()
+
+
+def read_provenance(root: Path, columns: Sequence[str] | None = None) -> list[dict[str, Any]] | None:
     """The rows of meta/msdyn/episodes.parquet in the order of the episodes; None if there is no such file.
+
+    `columns` names those to read, if not all; the ones that are checked are always among them.
 
     Raises:
         DatasetError: it is damaged, or not one row per episode.
@@ -152,7 +168,9 @@ def read_provenance(root: Path) -> list[dict[str, Any]] | None:
     if not path.is_file():
         return None
     try:
-        rows: list[dict[str, Any]] = pq.read_table(path).to_pylist()
+        names = pq.read_schema(path).names
+        wanted = names if columns is None else [name for name in names if name in (*CHECKED, *columns)]
+        rows: list[dict[str, Any]] = pq.read_table(path, columns=wanted).to_pylist()
         rows = sorted(rows, key=lambda row: row["episode_index"])
         complete = [(row["episode_index"], bool(row["source_repo_id"]), row["source_episode"] >= 0) for row in rows]
     except (OSError, KeyError, TypeError, pa.ArrowException) as error:

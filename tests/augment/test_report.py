@@ -16,7 +16,7 @@ from lerobot_msdyn.augment import __main__ as augment
 from lerobot_msdyn.augment import episode as episodes
 from lerobot_msdyn.augment.report import build
 from lerobot_msdyn.augment.report.drawing import cameras_from_above
-from lerobot_msdyn.augment.report.page import ADVICE, LISTED, Pictures, ViewEntry, camera_lines, page, summary
+from lerobot_msdyn.augment.report.page import ADVICE, LISTED, Origin, Pictures, ViewEntry, camera_lines, page, summary
 from lerobot_msdyn.augment.report.pictures import data_url, film, heat_map, spread, strip
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.reconstruction.account import Account, account_sentence
@@ -135,6 +135,21 @@ def test_it_opens_with_what_is_good_and_what_would_make_the_rest_better() -> Non
     assert '<article class="doubtful">' in text
     assert "doubtful: 17.0 dB expected" in text
     assert text.index("1 of 3 views good") < text.index("<h2>")
+
+
+def test_the_worst_come_first_and_assumed_depth_is_said_above_all() -> None:
+    pictures = Pictures("", "", 1, 1.0, None, "", "")
+    good, bad = entry(0, **scored(25, "depth"), pictures=pictures), entry(1, **scored(15, "depth"), pictures=pictures)
+    dropped = entry(2, **scored(10, "depth"), rejected=["dim"], dropped=True, pair="data:image/jpeg;base64,")
+    origin = Origin({"depth": NASTY}, True, NASTY, {NASTY: "data:image/jpeg;base64,"})
+    text = page("ds", {}, [good, bad, dropped], [], origin)
+    places = [text.index(f"<h3>Episode {number},") for number in (2, 1, 0)]
+    assert places == sorted(places)
+    assert text.index("Depth was assumed here") < text.index("<h2>")
+    assert "Depth was assumed" not in page("ds", {}, [good], [])
+    assert "A frame of it: recorded left, new right" in text
+    assert "<script" not in text
+    outline(text)
 
 
 def test_views_that_were_not_judged_are_shown_as_such() -> None:

@@ -39,6 +39,7 @@ logger = logging.getLogger(__name__)
 NAME = "report.html"
 PACKAGES = {"lerobot_msdyn": "lerobot_msdyn", "LeRobot": "lerobot"}
 PICTURED = 16  # views with pictures
+ASSUMED_PROVIDER = "plane"  # of depth
 MOST_LINKS = 6  # pictures of a robot's links
 MOST_SHEETS = 3  # of priors, of the views with the lowest scores
 
@@ -82,7 +83,7 @@ def write_report(
     _write_preview(source, output, root, entries, places)
     path = root / NAME
     figures = _figures(episodes, entries, skipped_episodes, seconds)
-    origin = Origin(_facts(source, episodes), _recipe(root), _sheets(entries), _links(root))
+    origin = _origin(source, root, episodes, entries)
     path.write_text(page(name, figures, entries, skipped, origin), encoding="utf-8")
     return path
 
@@ -103,21 +104,31 @@ def _write_preview(
         write_jpeg(root / PREVIEW, strip(list(before[few]), list(after[few])))
 
 
-def _facts(source: LeRobotDatasetMetadata, episodes: Iterable[NewEpisode]) -> dict[str, str]:
-    """What to say of how they were made."""
-    depths: dict[str, None] = {}
+def _origin(
+    source: LeRobotDatasetMetadata, root: Path, episodes: Iterable[NewEpisode], entries: Sequence[ViewEntry]
+) -> Origin:
+    """What to say of how the dataset in `root` was made."""
+    said: dict[str, None] = {}
+    assumed = False
     for episode in episodes:
         if episode.provenance.variant != SOURCE_VARIANT:
-            for camera, priors in episode.provenance.priors.items():
+            for name, priors in episode.provenance.priors.items():
                 depth = priors.get("depth", {})
-                why = f" ({depth['why']})" if depth.get("why") else ""
-                depths[f"{camera}: {depth.get('model', depth.get('provider', 'unknown'))}{why}"] = None
+                said[f"{name}: {_source_of(depth)}"] = None
+                assumed |= depth.get("provider") == ASSUMED_PROVIDER
     versions = [f"{title} {importlib.metadata.version(name)}" for title, name in PACKAGES.items()]
-    return {
+    facts = {
         "source": f"{source.repo_id}, {source.total_episodes} episodes, {source.total_frames} frames",
-        "depth": "; ".join(depths),
+        "depth": "; ".join(said),
         "made": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC, by {', '.join(versions)}",
     }
+    return Origin(facts, assumed, _recipe(root), _sheets(entries), _links(root))
+
+
+def _source_of(prior: Mapping[str, str]) -> str:
+    """Where a prior is from, and why from there."""
+    why = f" ({prior['why']})" if prior.get("why") else ""
+    return f"{prior.get('model', prior.get('provider', 'unknown'))}{why}"
 
 
 def _recipe(root: Path) -> str:

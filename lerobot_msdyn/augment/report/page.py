@@ -71,6 +71,10 @@ MEANING = (
     f"would have recorded, as PSNR in dB (more is better). A view is called good from {GOOD_DB:.0f} dB on; look at the "
     "others before you train on them. Depth that is wrong in the same way in all frames is not noticed."
 )
+ASSUMED = (
+    "Depth was assumed here (a table plane), and nothing can tell whether it is right: look at what moves before you "
+    "trust these scores."
+)
 ADVICE_FOR = ("doubtful", "dropped")
 # Cause of most of the expected error of those views -> what to do.
 ADVICE = {
@@ -152,6 +156,7 @@ class Origin:
     """What a dataset was made of, and how."""
 
     facts: Mapping[str, str] = field(default_factory=dict)  # by name: source, date, versions, depth
+    assumed_depth: bool = False  # whether scenes stand on a table plane that nobody has measured
     recipe: str = ""  # YAML
     sheets: Mapping[str, str] = field(default_factory=dict)  # pictures of priors, as data URLs, by what they are of
     links: Mapping[str, str] = field(default_factory=dict)  # the same of a robot's links over the video
@@ -193,6 +198,7 @@ def page(
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
         f"<title>{text(title)}</title><style>{STYLE}</style></head><body><main>"
         f'<h1>{text(title)}</h1><p class="lead">{text(summary(entries))}</p>'
+        f"{f'<p>{text(ASSUMED)}</p>' if origin.assumed_depth else ''}"
         f'<p class="soft">{text(MEANING)}</p>'
         f'<div class="figures">{top}</div>{left_out}'
         f"<h2>Views, worst first</h2>{''.join(_article(entry) for entry in shown[:LISTED])}"
