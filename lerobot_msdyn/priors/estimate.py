@@ -122,7 +122,7 @@ def _before_poses(request: Request, camera: CameraTrack, depth: Depth) -> Masks:
     return torch.from_numpy(request.cache.get("masks", "poses", settings, compute)["masks"])
 
 
-def check_named_providers(config: PriorsConfig, camera: CameraConfig, device: str = "auto") -> None:
+def check_named_providers(config: PriorsConfig, camera: CameraConfig, device: Device = "auto") -> None:
     """Whether the providers that settings name have what they need, before any video is read.
 
     Raises:
