@@ -20,6 +20,7 @@ from lerobot_msdyn.augment.report.build import entries_of, write_report
 from lerobot_msdyn.augment.report.page import accounts_of
 from lerobot_msdyn.augment.robot_cameras import calibration_episodes, publish
 from lerobot_msdyn.augment.run_identity import all_files, describe_run, recipe_text, source_files
+from lerobot_msdyn.augment.workers import terse
 from lerobot_msdyn.core.errors import DatasetError, EpisodeError
 from lerobot_msdyn.dataset.provenance import CALIBRATION, FOLDER, SOURCE_VARIANT, read_provenance
 from lerobot_msdyn.dataset.read import open_source
@@ -49,10 +50,11 @@ def open_job(config: AugmentConfig, root: Path | None) -> Opened:
     source = open_source(config.repo_id, root, config.tolerance_s)
     episodes = select_episodes(source, config.episodes)
     cameras = select_cameras(source, config.cameras, allow_moving=config.allow_moving)
-    if config.allow_moving:
-        cameras = cameras_off_the_gripper(source, cameras, config)
-    else:
-        cameras = still_cameras(source, episodes, cameras, config)
+    with terse(config):
+        if config.allow_moving:
+            cameras = cameras_off_the_gripper(source, cameras, config)
+        else:
+            cameras = still_cameras(source, episodes, cameras, config)
     return Opened(source, episodes, cameras)
 
 
