@@ -52,7 +52,10 @@ def main() -> None:
     begin = time.perf_counter()
     shutil.rmtree(OUT, ignore_errors=True)
     size = ["--episodes", "1", "--frames", "40", "--width", "320", "--height", "240"]
+    # What the first run on a machine compiles, on another core meanwhile.
+    compiling = subprocess.Popen([sys.executable, "-m", "lerobot_msdyn.render.warmup"], stderr=subprocess.DEVNULL)
     run("lerobot_msdyn.synthetic", "--out", str(OUT / "desk"), "--kind", "push", *size, *depth)
+    compiling.wait()
     run("lerobot_msdyn.augment", "--repo", "local/desk", "--root", str(OUT / "desk"), "--recipe", "quick")
 
     source = LeRobotDataset("local/desk", root=OUT / "desk", video_backend="pyav")
