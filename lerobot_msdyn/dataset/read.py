@@ -1,6 +1,5 @@
 """Read LeRobot episodes into plain tensors: pixels, cameras, recorded depth, state and action."""
 
-import difflib
 import io
 import itertools
 import logging
@@ -16,7 +15,6 @@ import numpy as np
 import PIL.Image
 import pyarrow as pa
 import torch
-from huggingface_hub import HfApi
 from jaxtyping import Float, UInt8
 from lerobot.configs import DepthEncoderConfig
 from lerobot.datasets import LeRobotDatasetMetadata
@@ -33,6 +31,7 @@ from lerobot_msdyn.dataset.calibration import make_camera, read_robot
 from lerobot_msdyn.dataset.checks import IntactEpisodes, check_metadata, picture_size, read_json
 from lerobot_msdyn.dataset.chroma import is_subsampled, restore_chroma
 from lerobot_msdyn.dataset.features import completed
+from lerobot_msdyn.dataset.named import check_named, no_dataset
 from lerobot_msdyn.dataset.rows import TIMESTAMP_TOLERANCE_S, on_grid, read_rows, source_file, task_of
 from lerobot_msdyn.dataset.video_index import (
     VIDEO_ERRORS,
@@ -50,8 +49,6 @@ logger = logging.getLogger(__name__)
 CODEBASE_VERSION = "v3.0"
 BLOCK_FRAMES = 128  # that are decoded at once
 MILLIMETRES = 1000.0
-HUB_TIMEOUT_S = 10
-INFO_PLACES = "*/*/meta/info.json"  # of the datasets in LeRobot's home
 
 
 @dataclass(frozen=True)
@@ -105,7 +102,7 @@ def open_source(
     if not (folder / "meta" / "info.json").exists():
         if root is not None:
             check_root(root)
-        folder = _from_hub(repo_id, folder)
+        folder = _from_hub(repo_id)
     check_version(folder)
     intact = check_metadata(folder)
     try:
@@ -134,24 +131,13 @@ def _without_unfinished(repo_id: str, folder: Path, intact: IntactEpisodes) -> S
     return source
 
 
-def _from_hub(repo_id: str, folder: Path) -> Path:
+def _from_hub(repo_id: str) -> Path:
     """Where LeRobot put a dataset that it downloaded."""
+    check_named(repo_id)
     try:
-        # LeRobot tries again and again, for minutes where the hub cannot be reached: asked once first
-        HfApi().dataset_info(repo_id, timeout=HUB_TIMEOUT_S)
         return LeRobotDatasetMetadata(repo_id).root
     except Exception as error:
-        near = difflib.get_close_matches(repo_id, _local_names(), n=1)
-        hint = f"did you mean {near[0]!r}? Else" if near else "if it lies elsewhere,"
-        raise DatasetError(
-            f"no dataset {repo_id!r}: not in {folder}, and the hub does not have it or cannot be reached "
-            f"({type(error).__name__}); {hint} give its folder with --root"
-        ) from error
-
-
-def _local_names() -> list[str]:
-    """Names of the datasets in LeRobot's home."""
-    return [path.parents[1].relative_to(HF_LEROBOT_HOME).as_posix() for path in HF_LEROBOT_HOME.glob(INFO_PLACES)]
+        raise no_dataset(repo_id, error) from error
 
 
 def check_version(root: Path) -> None:

@@ -10,7 +10,6 @@ from lerobot.datasets import LeRobotDataset
 
 from lerobot_msdyn.core.config import CameraConfig
 from lerobot_msdyn.core.errors import DatasetError, EpisodeError
-from lerobot_msdyn.dataset import read
 from lerobot_msdyn.dataset.chroma import restore_chroma
 from lerobot_msdyn.dataset.read import open_source, read_episode
 
@@ -56,21 +55,6 @@ def test_no_such_dataset(tmp_path: Path) -> None:
     assert not (tmp_path / "absent").exists()
     with pytest.raises(DatasetError, match="no dataset 'local/absent'"):
         open_source("local/absent")
-
-
-def test_a_mistyped_name_is_answered_at_once_with_the_nearest_one(tmp_path: Path, monkeypatch) -> None:
-    """LeRobot would try to reach the hub for minutes."""
-    (tmp_path / "local" / "desk" / "meta").mkdir(parents=True)
-    (tmp_path / "local" / "desk" / "meta" / "info.json").write_text("{}")
-    monkeypatch.setattr(read, "HF_LEROBOT_HOME", tmp_path)
-
-    def unreachable(self: object, repo_id: str, timeout: float) -> None:
-        raise ConnectionError
-
-    monkeypatch.setattr(read.HfApi, "dataset_info", unreachable)
-    monkeypatch.setattr(read, "LeRobotDatasetMetadata", lambda repo_id: pytest.fail("LeRobot was asked"))
-    with pytest.raises(DatasetError, match=r"ConnectionError\); did you mean 'local/desk'\?"):
-        open_source("local/dsk")
 
 
 def copy_with_info(desk: Path, tmp_path: Path, **changes: object) -> Path:
