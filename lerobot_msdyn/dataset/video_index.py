@@ -148,8 +148,9 @@ def frame_numbers(
 ) -> list[int]:
     """Which frames of a file belong to the rows of one episode.
 
-    Where a file has exactly as many frames as its episodes have rows, they are dealt out in order. Else an episode has
-    the frames from its start up to its end or the next start; if these are as many as its rows, they are its rows', and
+    Where a file has exactly as many frames as its episodes have rows, they are dealt out in order, unless metadata
+    places an episode exactly on another frame. Else an episode has the frames from its start up to its end or the next
+    start; if these are as many as its rows, they are its rows', and
     if they are more, they must be at the rows' times (a video of twice the rate).
 
     Args:
@@ -166,8 +167,18 @@ def frame_numbers(
     times, position = video.times, [one.episode for one in placed].index(episode)
     me, rows, total = placed[position], len(row_times), sum(one.rows for one in placed)
     firsts = np.cumsum([0, *(one.rows for one in placed[:-1])])
-    if total == len(times) and not _contradicted(times, placed, firsts, fps):
-        return list(range(firsts[position], firsts[position] + rows))
+    if total == len(times):
+        counted = list(range(firsts[position], firsts[position] + rows))
+        if not _contradicted(times, placed, firsts, fps):
+            return counted
+        if any(np.abs(times - one.start_s).min() > SURE / fps for one in placed):  # no start can be relied on
+            if abs(times[firsts[position]] - me.start_s) <= SURE / fps:
+                return counted
+            raise DatasetError(
+                f"it starts at {me.start_s:.4f} s of {video.path}, by counting frames at {times[counted[0]]:.4f} s, "
+                "and others start between two frames: nothing says which are its own; correct from_timestamp in "
+                "meta/episodes"
+            )
     half = 0.5 / fps
     twin = next((one.episode for one in placed if one is not me and abs(one.start_s - me.start_s) < half), None)
     if twin is not None:

@@ -225,6 +225,19 @@ def test_starts_off_the_grid(tmp_path: Path, drift: float) -> None:
     written(tmp_path / "bars", tmp_path / "new")
 
 
+def test_a_start_that_drifts_by_a_whole_frame_is_not_believed(tmp_path: Path) -> None:
+    """Half a frame more with every episode: the third starts exactly on a frame, which is the second of its own."""
+    record(tmp_path / "bars", (5, 5, 5, 5))
+    starts = [0.5 * i + 0.05 * i for i in range(4)]
+    place(tmp_path / "bars", starts, [start + 0.5 for start in starts])
+    problems = readable(tmp_path / "bars")
+    assert not problems[0]
+    assert "it starts at 0.5500 s" in problems[1]
+    assert "it starts at 1.1000 s" in problems[2]
+    assert "by counting frames at 1.0000 s" in problems[2]
+    assert "it starts at 1.6500 s" in problems[3]
+
+
 def test_a_start_between_two_frames_that_is_nobodys(tmp_path: Path) -> None:
     episodes = record(tmp_path / "bars", LENGTHS)
     write_video(video_of(tmp_path / "bars"), [code for codes in episodes for code in codes][:-1])
