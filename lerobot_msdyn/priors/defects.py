@@ -149,8 +149,11 @@ def _stray_start(small: UInt8[ndarray, "t a b 3"], before: UInt8[ndarray, "a b 3
     return jump > STRAY * float(np.quantile(changes, 0.95)) and _difference(before, small[0]) < BELONGS * jump
 
 
-def _difference(a: UInt8[ndarray, "a b 3"], b: UInt8[ndarray, "a b 3"]) -> float:
-    return float(cv2.absdiff(a, b).mean())
+def _difference(before: UInt8[ndarray, "a b 3"], after: UInt8[ndarray, "a b 3"]) -> float:
+    """Of two pictures, beside a change of the exposure."""
+    lit = before.mean(-1) > DARK_GREY_LEVELS
+    gain = float(np.median(after.mean(-1)[lit] / before.mean(-1)[lit])) if lit.any() else 1.0
+    return float(np.abs((gain * before).clip(0, 255) - after).mean())
 
 
 def _runs(numbers: tuple[int, ...] | list[int]) -> tuple[tuple[int, int], ...]:

@@ -109,6 +109,20 @@ def test_a_step_of_the_exposure(clip: Tensor, state: Tensor, factor: float) -> N
     assert gain == pytest.approx(factor, rel=0.05)
 
 
+@pytest.mark.parametrize("factor", [0.5, 0.7, 1.3])
+def test_a_first_frame_of_another_exposure_is_not_of_the_episode_before(
+    clip: Tensor, state: Tensor, factor: float
+) -> None:
+    stepped = clip.clone()
+    stepped[1:] = (clip[1:].float() * factor).clamp(0, 255).byte()
+    found = find_defects(stepped, state, clip[:1])
+    assert not found.stray_start
+    assert [frame for frame, _ in found.exposure_steps] == [1]
+    before = (clip[-1:].float() * factor).clamp(0, 255).byte()
+    stepped[0] = clip[-1]
+    assert find_defects(stepped, state, before).stray_start, "another moment, whatever its exposure"
+
+
 def test_slow_changes_of_brightness_are_no_step(clip: Tensor, state: Tensor) -> None:
     fading = (clip.float() * torch.linspace(1, 0.6, FRAMES)[:, None, None, None]).to(torch.uint8)
     assert find_defects(fading, state).exposure_steps == ()
