@@ -27,7 +27,7 @@ BELONGS = 0.5  # of that difference, under which it belongs to the episode befor
 STEP = 0.06  # logarithm of the gain from one frame to the next that is a step, ...
 STEP_RATIO = 6.0  # ... and times the usual one
 EVEN = 0.5  # share of the pixels that must change alike
-DARK_GREY_LEVELS = 4.0  # added to both sides of a ratio
+DARK_GREY_LEVELS = 4.0  # added to both sides of a ratio; a pixel that is darker has none that tells
 
 
 @dataclass(frozen=True)
