@@ -220,7 +220,7 @@ def robot_cameras(
     of_cameras = {key: places_of(source, key, episodes) for key in cameras}
     read = {index for places in of_cameras.values() for one in places for index in _some(one, max_episodes)}
     states = _states(source, sorted(read))
-    mapping = map_joints(robot, _names(source), np.concatenate(list(states.values())), config.units, config.joints)
+    mapping = map_joints(robot, names_of_state(source), np.concatenate(list(states.values())), config.units, config.joints)
     places: dict[str, list[Place]] = {}
     for key, groups in of_cameras.items():
         places[key] = []
@@ -331,10 +331,14 @@ def _states(source: LeRobotDatasetMetadata, episodes: Sequence[int]) -> States:
     return states
 
 
-def _names(source: LeRobotDatasetMetadata) -> list[str] | None:
-    """Of the state's numbers."""
-    names = source.features[OBS_STATE].get("names")
-    listed = next(iter(names.values())) if isinstance(names, dict) and len(names) == 1 else names
+def names_of_state(source: LeRobotDatasetMetadata) -> list[str] | None:
+    """Of the state's numbers, which some datasets wrap in a list or under a heading."""
+    listed = source.features[OBS_STATE].get("names")
+    while isinstance(listed, list | tuple | dict) and len(listed) == 1:
+        inner = next(iter(listed.values() if isinstance(listed, dict) else listed))
+        if not isinstance(inner, list | tuple | dict):
+            break
+        listed = inner
     return [str(name) for name in listed] if isinstance(listed, list | tuple | dict) else None
 
 

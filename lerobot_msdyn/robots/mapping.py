@@ -49,8 +49,8 @@ def map_joints(
 ) -> JointMap:
     """The joints that a state holds, by their names.
 
-    Names are compared without case and without `.pos`. Where none of them agrees but there are as many numbers as
-    joints, they are taken in the robot's order.
+    Names are compared by their letters and digits, without `.pos`, `joint` and the k of constants (kLeftElbow). Where
+    none of them agrees but there are as many numbers as joints, they are taken in the robot's order.
 
     Args:
         robot: the robot.
@@ -124,7 +124,8 @@ def _label(names: Sequence[str] | None, column: int, joint: str) -> str:
 
 
 def _plain(name: str) -> str:
-    return name.lower().removesuffix(".pos").removesuffix("_joint")
+    name = re.sub(r"^k(?=[A-Z])", "", name).lower().removesuffix(".pos")
+    return re.sub(r"[^a-z0-9]", "", name).removesuffix("joint")
 
 
 def _listed(robot: Robot) -> str:

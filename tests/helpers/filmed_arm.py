@@ -1,7 +1,8 @@
 """A dataset of a made-up arm in front of a textured table, as a fixed camera sees it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -46,15 +47,20 @@ def write_filmed(
     frames: int = 24,
     names: tuple[str, ...] = NAMES,
     moved_px: Sequence[tuple[int, int]] = (),
+    others: Mapping[str, Pose] = MappingProxyType({}),
 ) -> Path:
-    """Episodes of the arm swinging; `moved_px` are those by which pictures begin and end to the side, by episode."""
+    """Episodes of the arm swinging, seen by a camera and by others.
+
+    `moved_px` are those by which pictures begin and end to the side, by episode.
+    """
+    picture = {"dtype": "image", "shape": (HEIGHT, WIDTH, 3), "names": ["height", "width", "channels"]}
     dataset = LeRobotDataset.create(
         "local/arm",
         FPS,
         {
             "observation.state": {"dtype": "float32", "shape": (6,), "names": list(names)},
             "action": {"dtype": "float32", "shape": (6,), "names": list(names)},
-            FRONT: {"dtype": "image", "shape": (HEIGHT, WIDTH, 3), "names": ["height", "width", "channels"]},
+            **{key: dict(picture) for key in (FRONT, *others)},
         },
         root=root,
         robot_type="so101_follower",
@@ -63,9 +69,10 @@ def write_filmed(
     for episode in range(episodes):
         state = swing(frames, episode).astype(np.float32)
         begins, ends = moved_px[episode] if moved_px else (0, 0)
-        for t, (row, still) in enumerate(zip(state, pictures(robot, pose, state), strict=True)):
-            picture = np.roll(still, begins if t < frames // 2 else ends, axis=1)
-            dataset.add_frame({"observation.state": row, "action": row, FRONT: picture, "task": "swing"})
+        seen = {key: pictures(robot, each, state) for key, each in {FRONT: pose, **others}.items()}
+        for t, row in enumerate(state):
+            shifted = {key: np.roll(of[t], begins if t < frames // 2 else ends, axis=1) for key, of in seen.items()}
+            dataset.add_frame({"observation.state": row, "action": row, "task": "swing"} | shifted)
         dataset.save_episode(parallel_encoding=False)
     dataset.finalize()
     return root

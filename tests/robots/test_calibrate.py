@@ -105,6 +105,33 @@ def test_poses_of_the_hand_are_refused(arm: Robot, urdf: Path, tmp_path: Path) -
         command(root, urdf, tmp_path / "c.json")
 
 
+def test_two_cameras_of_one_arm_share_its_world(arm: Robot, urdf: Path, tmp_path: Path) -> None:
+    side, key = camera(35, 40, 1.0, 60), "observation.images.side"
+    root = write_filmed(tmp_path / "arm", arm, POSE, 2, 30, others={key: side})
+    out = tmp_path / "both.json"
+    assert command(root, urdf, out) == 0
+    true = {FRONT: POSE, key: side}
+    found = {name: read_calibration(out, name, 0, 1, WIDTH, HEIGHT) for name in true}
+    apart = {}
+    for name, pose in true.items():
+        view = found[name]
+        assert view is not None
+        matrix = view.world_from_camera[0].numpy()
+        assert np.linalg.norm(matrix[:3, 3] - pose.centre) < 0.02 * pose.distance
+        apart[name] = matrix
+    relative = np.linalg.inv(apart[FRONT]) @ apart[key]
+    wanted = POSE.rotation @ side.rotation.T
+    assert np.degrees(np.arccos((np.trace(relative[:3, :3] @ wanted.T) - 1) / 2)) < 1.0
+    assert {path.name for path in tmp_path.glob("*.png")} == {"both_links_front.png", "both_links_side.png"}
+
+
+@pytest.mark.parametrize("wrap", [lambda names: [names], lambda names: {"motors": names}, lambda names: names])
+def test_names_may_be_wrapped(recorded: Path, wrap: Any) -> None:
+    source = open_source("local/arm", recorded)
+    source.features["observation.state"]["names"] = wrap(list(NAMES))
+    assert robot_cameras.names_of_state(source) == list(NAMES)
+
+
 def test_too_few_frames_are_refused(arm: Robot, urdf: Path, tmp_path: Path) -> None:
     root = write_filmed(tmp_path / "short", arm, POSE, 1, 5)
     with pytest.raises(DatasetError, match="5 frames; expected at least 12"):

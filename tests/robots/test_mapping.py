@@ -49,6 +49,12 @@ def test_the_same_state_in_other_units(arm: Robot) -> None:
     assert other.values(state) == pytest.approx(map_joints(arm, NAMES, state, "normalised").values(state))
 
 
+@pytest.mark.parametrize("style", ["{}", "{}.pos", "{}_joint", "k{}", "{}Joint"])
+def test_names_in_other_styles(arm: Robot, style: str) -> None:
+    names = [style.format(name.capitalize()) for name in ("pan", "lift", "elbow", "wrist", "roll", "gripper")]
+    assert map_joints(arm, names, moving(-50, 50)).columns.tolist() == list(range(6))
+
+
 def test_joints_that_are_not_recorded_rest(arm: Robot) -> None:
     state = moving(-50, 50)[:, :5]
     mapped = map_joints(arm, ["pan", "lift", "elbow", "wrist", "roll"], state)

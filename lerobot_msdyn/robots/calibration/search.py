@@ -5,7 +5,7 @@ what does not move with the joints then weighs nothing.
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -90,12 +90,15 @@ class Agreement:
         return product / max(np.sqrt(square * self.energy), 1e-9)
 
 
-def search(masks: Bool[ndarray, "t h w"], points: Float32[ndarray, "t n 3"]) -> list[Candidate]:
+def search(
+    masks: Bool[ndarray, "t h w"], points: Float32[ndarray, "t n 3"], likely: Sequence[Pose] = ()
+) -> list[Candidate]:
     """The cameras in which links and masks agree best, the best first.
 
     Args:
         masks: of what moves, in frames that differ.
         points: of the links' surfaces in the robot's frame, in the same frames (m).
+        likely: cameras that are tried in any case.
     """
     order = np.random.default_rng(0).permutation(points.shape[1])
 
@@ -108,7 +111,8 @@ def search(masks: Bool[ndarray, "t h w"], points: Float32[ndarray, "t n 3"]) -> 
     with ThreadPoolExecutor(os.cpu_count() or 1, "cameras") as pool:
         for agreement_of, count, steps, size in zip((second, second, third), TRIES, STEPS, STEP_SIZES, strict=True):
             tried = partial(improved, agreement_of, steps=steps, size=size)
-            found = list(pool.map(tried, [each.pose for each in _distinct(found, count)]))
+            near = likely if agreement_of is third else ()
+            found = list(pool.map(tried, [*near, *(each.pose for each in _distinct(found, count))]))
     return _distinct(found, len(found))
 
 

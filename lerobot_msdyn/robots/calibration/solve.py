@@ -13,6 +13,7 @@ from numpy import ndarray
 
 from lerobot_msdyn.robots.calibration.contours import Posed, signed_distance
 from lerobot_msdyn.robots.calibration.frames import spread_frames, surface
+from lerobot_msdyn.robots.calibration.mounts import mounted_cameras
 from lerobot_msdyn.robots.calibration.refine import Problem, Solution, Spread, hits, refined
 from lerobot_msdyn.robots.calibration.search import Candidate, Pose, angle_between, search
 from lerobot_msdyn.robots.description import Robot
@@ -84,7 +85,7 @@ def solve(robot: Robot, values: Float64[ndarray, "t j"], rate: Float64[ndarray, 
     few = used[:FEW]
     masks = pictures.moving(few)
     coarse = Problem(robot, values[few], rate[few], signed_distance(masks), Spread())
-    solution, margin = _chosen(coarse, search(masks, points[few]))
+    solution, margin = _chosen(coarse, search(masks, points[few], mounted_cameras(robot, values)))
     verdict = _verdict(_slid(coarse, solution, values, rate, pictures, few, used, Spread(), False), held)
     if verdict[1] < GOOD_HITS:
         other = _verdict(_slid(coarse, solution, values, rate, pictures, few, used, WIDE, True), held)
