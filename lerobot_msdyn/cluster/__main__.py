@@ -72,7 +72,7 @@ def _start(config: ClusterConfig, job: "Job") -> int:
     if config.executor == "slurm":
         numbers = executors.run_slurm(job, config)
         sys.stdout.write(
-            f"submitted: jobs {', '.join(numbers)}; the last one writes {job.new_root}, or says what lacks\n"
+            f"submitted: jobs {', '.join(numbers)}; the last one writes {job.new_root}, or says what is missing\n"
             f"watch: squeue --me; logs: {job.logs}\nafterwards, the same command says how it went, and goes on\n"
         )
         return EXIT_OK

@@ -97,7 +97,7 @@ class Kept:
             return load_value(path, self.folder)
         except ValueFileError as error:
             path.unlink(missing_ok=True)
-            raise OutputError(f"{error}; give the same command again, which makes it anew") from error
+            raise OutputError(f"{error}; give the same command again to make it anew") from error
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
@@ -237,7 +237,7 @@ class Staging(Kept):
             changes = differences(before, run)
             if changes:
                 raise OutputError(f"{self.folder} holds an unfinished run that {_how_to_go_on(changes)}")
-            logger.info("going on with the unfinished run in %s: %d episodes are done", self.folder, self.finished())
+            logger.info("continuing the unfinished run in %s: %d episodes are done", self.folder, self.finished())
             return
         self.clear()
         with writing(path):

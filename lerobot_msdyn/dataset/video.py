@@ -99,7 +99,7 @@ def encoder_of(feature: dict, key: str) -> RGBEncoderConfig | DepthEncoderConfig
     try:
         return kind.from_video_info(info)
     except (ValueError, TypeError) as error:
-        raise OutputError(f"{key}: cannot encode video as its source ({error})") from error
+        raise OutputError(f"{key}: cannot encode video like its source ({error})") from error
 
 
 def nvenc_of(encoder: RGBEncoderConfig | DepthEncoderConfig) -> RGBEncoderConfig | DepthEncoderConfig:

@@ -126,7 +126,7 @@ def test_what_cannot_be_encoded_is_said_before_any_work(tmp_path: Path) -> None:
     path.write_text(json.dumps(info))
     source = open_source("local/bars", tmp_path / "bars")
     with OutputDataset(source, "local/new", tmp_path / "new") as output:
-        with pytest.raises(OutputError, match=f"{FRONT}: cannot encode video as its source"):
+        with pytest.raises(OutputError, match=f"{FRONT}: cannot encode video like its source"):
             output.check([FRONT], depth=False)
         output.finish([NewEpisode(1, Provenance("local/bars", 1, SOURCE_VARIANT, 0))], "")  # a copy needs no encoder
 

@@ -90,7 +90,7 @@ def test_encoder_is_the_sources() -> None:
     encoder = encoder_of(feature, "front")
     assert (encoder.vcodec, encoder.pix_fmt, encoder.crf, encoder.g) == ("h264", "yuv444p", 18, 5)
     assert encoder_of({}, "front").vcodec == "libsvtav1"
-    with pytest.raises(OutputError, match="front: cannot encode video as its source"):
+    with pytest.raises(OutputError, match="front: cannot encode video like its source"):
         encoder_of({"info": {"video.codec": "vp9"}}, "front")
 
 

@@ -118,5 +118,5 @@ def test_depth_that_has_nothing_of_the_ground_is_refused_in_a_line() -> None:
     with pytest.raises(PriorError, match=r"agrees with the ground in \d+ % of its pixels; expected 15 %") as caught:
         put_together(clip(noise + 1e-3), shifted=False)
     assert "\n" not in str(caught.value)
-    with pytest.raises(PriorError, match="knows nothing of the ground"):
+    with pytest.raises(PriorError, match="unknown where the ground is seen"):
         put_together(torch.full((FRAMES, HEIGHT, WIDTH), torch.nan))

@@ -93,7 +93,7 @@ def _to_ground(still: Float[Tensor, "h w"], ground: Float[Tensor, "h w"], shifte
     chosen = evenly(len(x), SAMPLES)
     x, y = x[chosen], y[chosen]
     if len(x) < 2:
-        raise PriorError("the network's depth knows nothing of the ground")
+        raise PriorError("the network's depth is unknown where the ground is seen")
     pairs = torch.randint(len(x), (2, TRIALS), generator=torch.Generator().manual_seed(0))
     (x0, x1), (y0, y1) = x[pairs], y[pairs]
     if shifted:
