@@ -2,7 +2,7 @@
 
     python benchmarks/ablation.py [--kinds all,sheet,push,lid] [--seeds 0,1,2] [--sim FOLDER --scenes A,B] [--json FILE]
     python benchmarks/ablation.py --true_priors --rows "L1;L1-L3" [...]
-    python benchmarks/ablation.py --rows paper --width 320 --steps 300 --kinds= --sim FOLDER --sim_seeds 0,1,2 --json PAPER.json
+    python benchmarks/ablation.py --rows paper --width 320 --steps 300 --kinds= --sim FOLDER --json PAPER.json
     python benchmarks/ablation.py --report
 
 Every row is fitted to the same videos with the same priors (recorded depth, the project's own masks and tracks, or the

@@ -1,11 +1,13 @@
 """Command line: where the cameras of a robot stand, by its joints and what moves in its videos.
 
 python -m lerobot_msdyn.calibrate --repo local/ds --robot.name so101 --out calibration.json
+python -m lerobot_msdyn.calibrate --repo local/ds --robot.name so101 --cameras wrist --link gripper_link --out poses
 """
 
 import json
 import logging
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -22,7 +24,7 @@ COMMAND = "python -m lerobot_msdyn.calibrate"
 
 @dataclass
 class CalibrateConfig:
-    """`python -m lerobot_msdyn.calibrate`: pose and focal length of fixed cameras, from the joints and the videos."""
+    """`python -m lerobot_msdyn.calibrate`: where fixed cameras stand, or one on a link, by joints and videos."""
 
     # Source dataset (alias: --repo).
     repo_id: str = ""
@@ -36,8 +38,11 @@ class CalibrateConfig:
     max_episodes: int = between(10, 1, 1000)
     # Frames that are looked at of each place.
     frames: int = between(96, 12, 1000)
-    # The calibration file that is written, for --camera.calibration; pictures are written beside it.
-    out: Path = Path("calibration.json")
+    # The calibration file that is written, for --camera.calibration (default: calibration.json), with pictures beside
+    # it; with --link, the folder of poses (default: poses).
+    out: Path | None = None
+    # Link on which the camera of --cameras rides: its poses in all frames are written, for --camera.poses.
+    link: str = ""
     robot: RobotConfig = field(default_factory=RobotConfig)
 
 
@@ -49,17 +54,27 @@ def run(arguments: list[str]) -> int:
     config = parse_config(CalibrateConfig, arguments, ALIASES, command=COMMAND)
     if not config.repo_id:
         raise ConfigError(f"--repo is missing; expected: {COMMAND} --repo NAME [--root FOLDER] [--robot.name so101]")
-    from lerobot_msdyn.augment.robot_cameras import robot_cameras, summary
+    from lerobot_msdyn.augment.riding_cameras import riding_camera
+    from lerobot_msdyn.augment.robot_cameras import NAME, robot_cameras, summary
     from lerobot_msdyn.dataset.read import open_source
     from lerobot_msdyn.dataset.select import select_cameras, select_episodes
 
     source = open_source(config.repo_id, config.root)
     episodes = select_episodes(source, config.episodes)
-    keys = select_cameras(source, config.cameras)
+    keys = select_cameras(source, config.cameras, allow_moving=bool(config.link))
+    if config.link:
+        if len(keys) != 1:
+            raise ConfigError(f"--link is for one camera, which --cameras names; got {', '.join(keys)}")
+        riding = riding_camera(source, keys[0], config.link, episodes, config.robot, config.max_episodes)
+        sys.stdout.write(f"{riding}\n")
+        out = config.out or Path("poses")
+        whole = _poses_written(out, riding.write(source, out)) == len(episodes)
+        return EXIT_OK if whole else EXIT_SOME_EPISODES_FAILED
+    out = config.out or Path(NAME)
     found = robot_cameras(source, keys, episodes, config.robot, config.frames, config.max_episodes)
     for name, where, place in found.named():
         if place.verdict is not None:
-            picture = config.out.with_name(f"{config.out.stem}_{name}.png")
+            picture = out.with_name(f"{out.stem}_{name}.png")
             _written(picture, found.picture(place))
             sys.stdout.write(f"{where}  {summary(place.verdict)}\n{picture}\n")
         if place.doubt:
@@ -68,10 +83,21 @@ def run(arguments: list[str]) -> int:
         raise PriorError(
             f"{config.repo_id}: no camera could be told by {found.robot.name}'s joints: nothing was written"
         )
-    _written(config.out, json.dumps(found.content(source), indent=1).encode())
-    sys.stdout.write(f"{config.out}\n")
+    _written(out, json.dumps(found.content(source), indent=1).encode())
+    sys.stdout.write(f"{out}\n")
     complete = not any(place.doubt for _, _, place in found.named())
     return EXIT_OK if complete else EXIT_SOME_EPISODES_FAILED
+
+
+def _poses_written(out: Path, files: Iterator[Path]) -> int:
+    """How many there are."""
+    try:
+        count = len(list(files))
+    except OSError as error:
+        raise OutputError(f"{out} cannot be written ({error}); choose another folder by --out") from error
+    pattern = out / "episode_{episode:06d}" / "{camera}.npz"
+    sys.stdout.write(f"{count} files, for --camera.poses '{pattern}'\n")
+    return count
 
 
 def _written(path: Path, content: bytes) -> None:

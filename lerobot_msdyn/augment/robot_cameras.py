@@ -215,12 +215,11 @@ def robot_cameras(
         ConfigError: the robot's description cannot be had, or the state is not that of its joints.
         DatasetError: there is no state, or too few frames.
     """
-    found = find_description(config.urdf, config.name, source.info.robot_type)
-    robot = load_robot(found.urdf, found.licence, cache_folder("robots"))
+    robot = described(source, config)
     of_cameras = {key: places_of(source, key, episodes) for key in cameras}
     read = {index for places in of_cameras.values() for one in places for index in _some(one, max_episodes)}
-    states = _states(source, sorted(read))
-    mapping = map_joints(robot, names_of_state(source), np.concatenate(list(states.values())), config.units, config.joints)
+    states = states_of(source, sorted(read))
+    mapping = joints_of(source, robot, states, config)
     places: dict[str, list[Place]] = {}
     for key, groups in of_cameras.items():
         places[key] = []
@@ -318,7 +317,32 @@ def _some(episodes: Sequence[int], count: int) -> list[int]:
     return [episodes[int(k)] for k in evenly(len(episodes), count)]
 
 
-def _states(source: LeRobotDatasetMetadata, episodes: Sequence[int]) -> States:
+def described(source: LeRobotDatasetMetadata, config: RobotConfig) -> Robot:
+    """The robot of a dataset.
+
+    Raises:
+        ConfigError: its description cannot be had.
+    """
+    found = find_description(config.urdf, config.name, source.info.robot_type)
+    return load_robot(found.urdf, found.licence, cache_folder("robots"))
+
+
+def joints_of(source: LeRobotDatasetMetadata, robot: Robot, states: States, config: RobotConfig) -> JointMap:
+    """Which number of the state is which joint.
+
+    Raises:
+        ConfigError: the state is not that of the robot's joints.
+    """
+    every = np.concatenate(list(states.values()))
+    return map_joints(robot, names_of_state(source), every, config.units, config.joints)
+
+
+def states_of(source: LeRobotDatasetMetadata, episodes: Sequence[int]) -> States:
+    """What is recorded of the joints in the episodes that can be read.
+
+    Raises:
+        DatasetError: nothing is.
+    """
     if OBS_STATE not in source.features:
         raise DatasetError(f"{source.repo_id} has no {OBS_STATE}; expected the joint angles in it")
     states = {}

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 from made_up_arms import write_arm
+from ridden import Ridden, carried
 
 from lerobot_msdyn.robots import Robot, load_robot
 
@@ -21,3 +22,8 @@ def urdf(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def arm(urdf: Path) -> Robot:
     return load_robot(urdf)
+
+
+@pytest.fixture(scope="session")
+def ridden() -> Ridden:
+    return carried()

@@ -7,6 +7,7 @@ that stand on the ground, or that the gripper holds, are outliers.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -20,7 +21,7 @@ from lerobot_msdyn.core.corners import corners_followed
 from lerobot_msdyn.core.errors import PriorError
 
 GAPS_S = (0.4, 0.8, 1.2)  # from a frame to the others in which its corners are looked for
-STARTS = 40  # frames, evenly spread, whose corners are followed
+STARTS = 40  # frames, evenly spread over all videos, whose corners are followed
 LEAST_MATCHES = 200
 LEAST_FLOW_PX = 1.0  # of 320: corners that go less tell nothing
 TURNS_DEG = (0, 90, 180, 270)  # about the link's axis, from which the search starts; and the axis either way
@@ -57,17 +58,23 @@ class HandEye:
 
 
 def solve_hand_eye(
-    rgb: UInt8[ndarray, "t h w 3"],
-    world_from_link: Float64[ndarray, "t 4 4"],
+    rgb: Sequence[UInt8[ndarray, "_ h w 3"]],
+    world_from_link: Sequence[Float64[ndarray, "_ 4 4"]],
     fps: int | float,
     horizontal_fov_deg: float = 60.0,
 ) -> HandEye:
-    """The camera of a video whose link has these poses (m; the world's z axis is up).
+    """The camera of one or more videos whose link has these poses (m; the world's z axis is up).
+
+    Args:
+        rgb: the frames of each video, all of one size.
+        world_from_link: the link's poses at these frames, by the joints.
+        fps: of the videos.
+        horizontal_fov_deg: about what the camera has.
 
     Raises:
         PriorError: too few corners can be followed while the link moves, or no camera explains where they go.
     """
-    height, width = rgb.shape[1:3]
+    height, width = rgb[0].shape[1:3]
     first, second, here, there = _matches(rgb, fps)
     far = np.linalg.norm(there - here, axis=1) > LEAST_FLOW_PX * width / 320
     if far.sum() < LEAST_MATCHES:
@@ -81,7 +88,8 @@ def solve_hand_eye(
     unit = ROBUST_PX * width / 320
 
     def placed(x: Float64[ndarray, "9"]) -> Float64[ndarray, "n 2"]:
-        cameras = _at_lag(world_from_link, float(np.clip(x[8], -MOST_LAG_S, MOST_LAG_S)) * fps) @ _pose(x[:6])
+        frames = float(np.clip(x[8], -MOST_LAG_S, MOST_LAG_S)) * fps
+        cameras = np.concatenate([_at_lag(poses, frames) for poses in world_from_link]) @ _pose(x[:6])
         return _followed(cameras[first], cameras[second], here, math.exp(x[6]), x[7], (width, height))
 
     best, cost = None, np.inf
@@ -114,16 +122,20 @@ def _starts(focal_px: float) -> list[Float64[ndarray, "9"]]:
     return starts
 
 
-def _matches(rgb: UInt8[ndarray, "t h w 3"], fps: int | float) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-    """Frames and places (px) of corners, two by two."""
-    grey = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in rgb]
+def _matches(rgb: Sequence[UInt8[ndarray, "_ h w 3"]], fps: int | float) -> tuple[ndarray, ndarray, ndarray, ndarray]:
+    """Frames, counted through all videos, and places (px) of corners, two by two."""
     parts: list[tuple[ndarray, ...]] = []
-    for gap in sorted({max(1, round(seconds * fps)) for seconds in GAPS_S}):
-        for start in np.unique(np.linspace(0, max(len(rgb) - 1 - gap, 0), STARTS).round().astype(int)).tolist():
-            if start + gap < len(rgb):
-                here, there = corners_followed(grey[start], grey[start + gap])
-                count = len(here)
-                parts.append((np.full(count, start), np.full(count, start + gap), here + 0.5, there + 0.5))
+    begin = 0
+    for video in rgb:
+        grey = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in video]
+        for gap in sorted({max(1, round(seconds * fps)) for seconds in GAPS_S}):
+            starts = np.linspace(0, max(len(video) - 1 - gap, 0), -(-STARTS // len(rgb))).round().astype(int)
+            for start in np.unique(starts).tolist():
+                if start + gap < len(video):
+                    here, there = corners_followed(grey[start], grey[start + gap])
+                    frame = np.full(len(here), begin + start)
+                    parts.append((frame, frame + gap, here + 0.5, there + 0.5))
+        begin += len(video)
     if not parts:
         none = np.zeros(0, int)
         return none, none, np.zeros((0, 2)), np.zeros((0, 2))
