@@ -79,7 +79,7 @@ def estimate_priors(
         TrackProvider, config.tracks, posed, lambda provider: provider.estimate(posed, instances), file=TrackFile
     )
     if pinhole.is_static and depth.traits.metric:  # of a ground that is known: see docs/priors.md
-        depth = with_lying(depth, instances, tracks, pinhole)
+        depth = with_lying(depth, instances, tracks, pinhole, view.robot)
     if view.robot is not None:
         depth = with_robot_depth(depth, instances, view.robot, robot)
     if camera.fov_search:

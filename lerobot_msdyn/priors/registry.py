@@ -64,6 +64,7 @@ class Depth:
     traits: DepthTraits
     # m, of the ground that things stand on (and of a wall behind it), where depth is that of a ground.
     ground: Float[Tensor, "h w"] | None = None
+    lying: frozenset[int] = frozenset()  # instances that lie on the ground throughout
 
 
 class Provider(ABC):

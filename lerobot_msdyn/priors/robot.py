@@ -44,7 +44,8 @@ def with_robot_depth(depth: Depth, instances: Masks, robot: RobotSeen, label: in
     """Depth with the robot's, unless a sensor measured it.
 
     What else of the robot's mask lies beside its pixels has the depth of the nearest of them. Another instance that
-    touches a link that moves is as far away as that link where they touch: it may be held above the table.
+    touches a link that moves is as far away as that link where they touch, since it may be held above the table; one
+    that lies on the ground stays there.
 
     Args:
         depth: by others.
@@ -54,11 +55,12 @@ def with_robot_depth(depth: Depth, instances: Masks, robot: RobotSeen, label: in
     """
     if depth.traits.metric and depth.traits.measured:
         return depth
-    z = []
+    z, lying = [], torch.tensor(sorted(depth.lying), dtype=torch.uint8)
     for known, ids, moving, other in zip(robot.depth, instances, robot.moving, depth.z, strict=True):
         its = (ids == label) & (ids > 0)
         own = _spread(known, its)
-        held = _held(torch.where(its, 0, ids), torch.where(moving, known, 0.0), other)
+        free = torch.where(its | torch.isin(ids, lying), 0, ids)
+        held = _held(free, torch.where(moving, known, 0.0), other)
         z.append(torch.where(own > 0, own, held))
     return replace(depth, z=torch.stack(z))
 

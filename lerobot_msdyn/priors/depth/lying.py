@@ -1,32 +1,71 @@
-"""Things that lie on the ground rather than stand upright on it, told by their rigidity.
+"""Things that lie on the ground rather than stand upright on it, told by how they slide, and how high they are.
 
 Of depth that is assumed, an instance is a card that stands on its foot: right for a bottle, wrong for a keyboard or a
-book that is pushed about. Between the card and the ground lies a family of planes through the foot; that one is taken
-in which neighbouring points of the instance keep their distances best while it moves.
+book that is pushed about. Between the card and the ground lies a family of planes through the foot. What slides turns
+about the vertical and keeps its height, so that each plane says where its points must be seen at other times; the one
+is taken that says so best. A similar thing at another height would be seen in the same places: its thickness is told by
+the robot that touches it, if at all.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
+import cv2
+import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.core.geometry import nearest_pixel
-from lerobot_msdyn.core.observations import PointTracks
+from lerobot_msdyn.core.geometry import nearest_pixel, pixel_grid
+from lerobot_msdyn.core.observations import PointTracks, RobotSeen
 from lerobot_msdyn.core.sampling import evenly, scaled_px
 from lerobot_msdyn.priors.registry import Depth, Masks
 
-UPRIGHT = (0.0, 0.25, 0.5, 0.75)  # shares of the way from the ground to the depth so far, in inverse depth
-BETTER = 0.9  # of the spread of distances so far: as much a plane must lower it to
+UPRIGHT = (0.0, 0.25, 0.5, 0.75, 1.0)  # shares of the way from the ground to the depth so far, in inverse depth
+BETTER = 0.9  # of the error so far: as much a plane must lower it to
+MOST_PX = 1.5  # of 320, median: what is farther from where it must be does not slide
 FRAMES = 24  # that are compared
-NEIGHBOURS = 6  # of each point
-APART_PX = (5.0, 40.0)  # of 320: nearest and farthest neighbours
-LEAST_PAIRS = 100
-LEAST_FRAMES = 4  # in which both points of a pair are seen
+LEAST_POINTS = 20
+LEAST_SEEN = 8  # points that a frame must share with the one in which most are seen
+MOVED_PX = 3.0  # of 320, median: frames in which a thing is nearer to that place tell nothing
+OUTLIERS = 3.0  # times the median error beyond which a point does not count
+TOUCHING_PX = 1.5  # of 320: no farther apart are things that touch
+LEAST_TOUCHED, LEAST_TOUCHES = 8, 3  # pixels in a frame, and frames
+LOWEST = 0.2  # quantile of the heights of the links' pixels where they touch: of each frame, and over frames
+MOST_SHARE = 0.2  # of the camera's height that a thing that lies may be high
 
 
-def with_lying(depth: Depth, instances: Masks, tracks: PointTracks, camera: CameraTrack) -> Depth:
+@dataclass(frozen=True)
+class Ground:
+    """A plane before the camera, in its axes."""
+
+    point: Float[Tensor, "3"]  # m
+    axes: Float[Tensor, "3 3"]  # rows: two along the plane, and the normal, towards the camera
+
+    @classmethod
+    def under(cls, points: Float[Tensor, "n 3"]) -> "Ground":
+        """The plane through points."""
+        centre = points.mean(0)
+        axes = torch.linalg.svd(points - centre, full_matrices=False).Vh
+        return cls(centre, axes if float(axes[2] @ centre) < 0 else axes * torch.tensor([[1.0], [-1.0], [-1.0]]))
+
+    @property
+    def camera_m(self) -> float:
+        """Height of the camera above it."""
+        return -float(self.axes[2] @ self.point)
+
+    def coordinates(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+        """Along the plane, and the height above it (m)."""
+        return (points - self.point) @ self.axes.T
+
+    def points(self, coordinates: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+        """The inverse."""
+        return coordinates @ self.axes + self.point
+
+
+def with_lying(
+    depth: Depth, instances: Masks, tracks: PointTracks, camera: CameraTrack, robot: RobotSeen | None = None
+) -> Depth:
     """Depth in which instances lie as flat as their motion says.
 
     Args:
@@ -34,68 +73,113 @@ def with_lying(depth: Depth, instances: Masks, tracks: PointTracks, camera: Came
         instances: what moves.
         tracks: points on it.
         camera: a fixed one.
+        robot: which may touch them.
     """
     if depth.ground is None or not len(tracks):
         return depth
     z, ground = depth.z, depth.ground
+    lying = []
     for instance in tracks.instance.unique().tolist():
-        share = _upright(z, ground, tracks, tracks.instance == instance, camera)
-        if share < 1:
-            its = (instances == instance) & (z > 0)
-            z = torch.where(its, _between(z, ground, share), z)
-    return replace(depth, z=z)
+        rows = tracks.instance == instance
+        if int(rows.sum()) < LEAST_POINTS:
+            continue
+        its = (instances == instance) & (z > 0)
+        plane = _under(tracks.xy[rows], tracks.visible[rows], ground, camera)
+        share = _upright(z, ground, plane, tracks.xy[rows], tracks.visible[rows], camera)
+        if share == 1:
+            continue
+        high = 0.0 if robot is None else _height(its, robot, plane, camera)
+        z = torch.where(its, (1 - high / plane.camera_m) / (share / z.clamp(min=1e-6) + (1 - share) / ground), z)
+        lying.append(instance)
+    return replace(depth, z=z, lying=frozenset(lying))
 
 
-def _between(z: Float[Tensor, "*any"], ground: Float[Tensor, "*#any"], share: float) -> Float[Tensor, "*any"]:
-    """Depth (m) of a plane through the foot."""
-    return 1 / (share / z.clamp(min=1e-6) + (1 - share) / ground)
+def _rays(xy: Float[Tensor, "*n 2"], camera: CameraTrack) -> Float[Tensor, "*n 3"]:
+    """To pixels, of z-depth 1, in the camera's axes."""
+    return torch.cat((xy, torch.ones_like(xy[..., :1])), -1) @ torch.linalg.inv(camera.intrinsics[0]).T
+
+
+def _under(
+    xy: Float[Tensor, "n t 2"], visible: Bool[Tensor, "n t"], ground: Float[Tensor, "h w"], camera: CameraTrack
+) -> Ground:
+    """The ground where a thing is seen."""
+    seen = xy[visible]
+    return Ground.under(_rays(seen, camera) * ground[nearest_pixel(seen, camera.width, camera.height)][:, None])
 
 
 def _upright(
     z: Float[Tensor, "t h w"],
     ground: Float[Tensor, "h w"],
-    tracks: PointTracks,
-    rows: Bool[Tensor, " n"],
+    plane: Ground,
+    xy: Float[Tensor, "n t 2"],
+    visible: Bool[Tensor, "n t"],
     camera: CameraTrack,
 ) -> float:
-    """The share of `UPRIGHT` at which an instance is most rigid; 1 where none is clearly better."""
+    """The share of `UPRIGHT` at which a thing that slides is seen where it must be; 1 where none is clearly better."""
     frames = evenly(len(z), FRAMES)
-    xy, seen = tracks.xy[rows][:, frames], tracks.visible[rows][:, frames]
-    first, second = _pairs(xy, seen, camera.width)
-    if len(first) < LEAST_PAIRS:
+    xy, visible = xy[:, frames], visible[:, frames]
+    first = int(visible.sum(0).argmax())
+    kept = visible[:, first]
+    xy, visible = xy[kept], visible[kept]
+    pixel = nearest_pixel(xy[:, first], camera.width, camera.height)
+    own, under = z[(torch.full_like(pixel[0], int(frames[first])), *pixel)], ground[pixel]
+    known = own > 0
+    xy, visible, own, under = xy[known], visible[known], own[known], under[known]
+    apart = torch.where(visible, (xy - xy[:, first : first + 1]).norm(dim=-1), torch.nan).nanmedian(0).values
+    usable = (visible.sum(0) >= LEAST_SEEN) & (apart > scaled_px(MOVED_PX, camera.width))
+    if len(xy) < LEAST_POINTS or not bool(usable.any()):
         return 1.0
-    pixel = nearest_pixel(torch.where(seen[..., None], xy, 0.0), camera.width, camera.height)
-    own, under = z[(frames, *pixel)], ground[pixel]
-    seen = seen & (own > 0)
-    rays = torch.cat((xy, torch.ones_like(xy[..., :1])), -1) @ torch.linalg.inv(camera.intrinsics[0]).T
-    both = seen[first] & seen[second]
-    enough = both.sum(1) >= LEAST_FRAMES
-    first, second, both = first[enough], second[enough], both[enough]
-    if len(first) < LEAST_PAIRS:
-        return 1.0
-
-    def spread(share: float) -> float:
-        xyz = rays * _between(own, under, share)[..., None]
-        length = (xyz[first] - xyz[second]).norm(dim=-1).clamp(min=1e-6).log()
-        mean = (length * both).sum(1, keepdim=True) / both.sum(1, keepdim=True)
-        return float((((length - mean).square() * both).sum(1) / both.sum(1)).sqrt().median())
-
-    spreads = {share: spread(share) for share in UPRIGHT}
-    best = min(spreads, key=lambda share: spreads[share])
-    return best if spreads[best] < BETTER * spread(1.0) else 1.0
+    errors = {}
+    for share in UPRIGHT:
+        there = plane.coordinates(_rays(xy[:, first], camera) / (share / own + (1 - share) / under)[:, None])
+        found = [
+            _slid_px(there[visible[:, k]], xy[visible[:, k], k], plane, camera) for k in usable.nonzero()[:, 0].tolist()
+        ]
+        errors[share] = float(torch.tensor(found).median())
+    best = min(errors, key=lambda share: errors[share])
+    slides = errors[best] < scaled_px(MOST_PX, camera.width)
+    return best if slides and errors[best] < BETTER * errors[1.0] else 1.0
 
 
-def _pairs(
-    xy: Float[Tensor, "n t 2"], seen: Bool[Tensor, "n t"], width: int
-) -> tuple[Int[Tensor, " p"], Int[Tensor, " p"]]:
-    """Neighbouring points, where most points are seen at once."""
-    frame = int(seen.sum(0).argmax())
-    there = seen[:, frame].nonzero()[:, 0]
-    if len(there) < 2:
-        return there[:0], there[:0]
-    nearest, farthest = (scaled_px(px, width) for px in APART_PX)
-    distance = torch.cdist(xy[there, frame], xy[there, frame])
-    distance[(distance < nearest) | (distance > farthest)] = torch.inf
-    least, index = distance.topk(min(NEIGHBOURS, len(there)), largest=False)
-    row, column = least.isfinite().nonzero(as_tuple=True)
-    return there[row], there[index[row, column]]
+def _slid_px(there: Float[Tensor, "n 3"], xy: Float[Tensor, "n 2"], plane: Ground, camera: CameraTrack) -> float:
+    """How far points of a thing that slid are from where they must be seen (px, median), the best slide given.
+
+    Args:
+        there: along the ground and above it, before it slid.
+        xy: where they are seen now.
+        plane: the ground.
+        camera: that sees them.
+    """
+    rays = _rays(xy, camera) @ plane.axes.T
+    above = plane.camera_m - there[:, 2]
+    eye = plane.coordinates(torch.zeros(3))
+    now = eye[:2] + rays[:, :2] * (above / -rays[:, 2].clamp(max=-1e-6))[:, None]
+    weights = torch.ones(len(xy))
+    away = weights
+    for _ in range(2):
+        share = (weights / weights.sum())[:, None]
+        a, b = there[:, :2] - (share * there[:, :2]).sum(0), now - (share * now).sum(0)
+        cross, dot = (share[:, 0] * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])).sum(), (share * a * b).sum()
+        cosine, sine = dot / torch.hypot(dot, cross), cross / torch.hypot(dot, cross)
+        turn = torch.stack((torch.stack((cosine, sine)), torch.stack((-sine, cosine))))
+        moved = a @ turn + (share * now).sum(0)
+        seen = plane.points(torch.cat((moved, there[:, 2:]), 1)) @ camera.intrinsics[0].T
+        away = (seen[:, :2] / seen[:, 2:].clamp(min=1e-6) - xy).norm(dim=-1)
+        weights = (away <= OUTLIERS * away.median()).float()
+    return float(away.median())
+
+
+def _height(its: Bool[Tensor, "t h w"], robot: RobotSeen, plane: Ground, camera: CameraTrack) -> float:
+    """How high above the ground the robot touches a thing, at the lowest (m): it is at least about as thick."""
+    window = np.ones((2 * max(1, round(scaled_px(TOUCHING_PX, camera.width))) + 1,) * 2, np.uint8)
+    rays = _rays(pixel_grid(camera.height, camera.width), camera)
+    heights = []
+    for mask, depth, moving in zip(its, robot.depth, robot.moving, strict=True):
+        grown = torch.from_numpy(cv2.dilate(mask.numpy().astype(np.uint8), window) > 0)
+        touched = grown & ~mask & moving & (depth > 0)
+        if int(touched.sum()) >= LEAST_TOUCHED:
+            height = plane.coordinates(rays[touched] * depth[touched][:, None])[:, 2]
+            heights.append(height.quantile(LOWEST))
+    if len(heights) < LEAST_TOUCHES:
+        return 0.0
+    return float(torch.stack(heights).quantile(LOWEST).clamp(0, MOST_SHARE * plane.camera_m))
