@@ -27,7 +27,8 @@ def without_contradicted(scene: DynamicScene, view: View) -> DynamicScene:
 
     Where depth is not recorded, points that follow the motion of another body than their own are not contradicted by
     depth; they are specks of its colour on the other. A Gaussian is compared with the pixel onto which it is projected
-    and those beside it, as edges are a pixel wide.
+    and those beside it, as edges are a pixel wide; where the picture is right there, it is not held against a Gaussian
+    that its own colour is another, as those of fine texture, which blend, may be.
 
     Args:
         scene: fitted, without an overlay.
@@ -57,9 +58,12 @@ def _compared(
     seen = projected(means, camera)
     row, column = seen.pixel
     height, width = recorded.shape[:2]
+    rendering = render_scene(scene, camera, frame)
+    away = (rendering.rgb[0].clamp(0, 1) - recorded).abs().mean(-1)
+    away = torch.nn.functional.max_pool2d(away[None, None], 3, stride=1, padding=1)[0, 0]
     error = torch.full_like(means[:, 0], float("inf"))
     for down in (-1, 0, 1):
         for right in (-1, 0, 1):
             pixel = recorded[(row + down).clamp(0, height - 1), (column + right).clamp(0, width - 1)]
             error = torch.minimum(error, (pixel - colours).abs().mean(-1))
-    return seen.visible(render_scene(scene, camera, frame).depth[0]), error > COLOUR_ERROR
+    return seen.visible(rendering.depth[0]), (error > COLOUR_ERROR) & (away[row, column] > COLOUR_ERROR)

@@ -11,7 +11,7 @@ from lerobot_msdyn.motion.model.bases import identity_level
 from lerobot_msdyn.reconstruction.background import background_gaussians, pixel_gaussians
 from lerobot_msdyn.reconstruction.prune import without_contradicted
 from lerobot_msdyn.scene.dynamic import DynamicScene
-from lerobot_msdyn.scene.gaussians import rgb_to_sh
+from lerobot_msdyn.scene.gaussians import concatenate, rgb_to_sh
 from lerobot_msdyn.scene.shading import no_shading
 
 WIDTH, HEIGHT, FRAMES = 32, 24, 6
@@ -53,6 +53,19 @@ def test_specks_of_another_colour_go(square: tuple[DynamicScene, View]) -> None:
     kept = torch.ones(len(scene.moving), dtype=torch.bool).index_fill_(0, specks, False)
     torch.testing.assert_close(pruned.moving.means, scene.moving.means[kept])
     assert len(pruned.indices[0]) == len(pruned.logits[0]) == len(pruned.moving)
+
+
+def test_a_colour_that_leaves_the_picture_right_is_no_reason(square: tuple[DynamicScene, View]) -> None:
+    scene, view = square
+    faint = torch.tensor([18, 27])
+    scene = painted(scene, faint)
+    scene.moving.opacity_logits[faint] = -3.0
+    more = pixel_gaussians(view.rgb[0], torch.full((HEIGHT, WIDTH), 0.8), view.camera, 0)[0]
+    beside = more.select((view.rgb[0] == RED).all(-1).reshape(-1))
+    moving = concatenate([scene.moving, beside])
+    rows = torch.zeros(len(moving), 1)
+    scene = dataclasses.replace(scene, moving=moving, indices=(rows.long(),), logits=(rows,))
+    assert len(without_contradicted(scene, view).moving) == len(moving)
 
 
 def test_a_colour_that_is_wrong_for_a_short_time_is_no_reason(square: tuple[DynamicScene, View]) -> None:
