@@ -17,7 +17,7 @@ def test_the_table_is_where_trigonometry_puts_it() -> None:
     assert (depth[23, 0] + depth[24, 0]).item() / 2 == pytest.approx(1.0, abs=2e-3)
     # 23.5 px below, the ray descends cos 30 * 0.47 + sin 30 metres per metre of z
     assert depth[47, 5].item() == pytest.approx(0.5 / (0.47 * math.cos(math.pi / 6) + 0.5), rel=1e-5)
-    assert depth[0, 0].item() == pytest.approx(3.0)  # the wall, three times as far as the centre
+    assert depth[0, 0].item() == pytest.approx(2.0)  # the wall, twice as far as the centre
 
 
 def test_a_moving_thing_stands_on_the_table() -> None:

@@ -25,6 +25,7 @@ FARTHEST_GROUND = 0.3  # share of the largest inverse depth of the ground, below
 LEAST_GROUND = 0.15  # share of the pixels before that, that must agree
 TRIALS, SAMPLES = 600, 4000  # alignments by two pixels each; pixels that judge them
 BEHIND_FOOT = 1.15  # times as far as its foot: what moves is not there
+BEYOND_WALL = 1.5  # times as far as the wall that is assumed behind the ground, a network may see
 
 
 def fused(
@@ -66,7 +67,8 @@ def fused(
     empty = (scale * still.nan_to_num(nan=0.0) + shift).clamp(min=least)
     moving = _not_behind_feet(depth, instances, standing)
     if known:
-        empty, moving = _above(empty, ground.reciprocal()), torch.minimum(moving, ground)
+        farthest = torch.where(ground < ground.max(), ground, BEYOND_WALL * ground)
+        empty, moving = _above(empty, farthest.reciprocal()), torch.minimum(moving, farthest)
     return torch.where(instances > 0, moving, empty.reciprocal())
 
 

@@ -83,13 +83,14 @@ def with_lying(
         rows = tracks.instance == instance
         if int(rows.sum()) < LEAST_POINTS:
             continue
-        its = (instances == instance) & (z > 0)
+        its = instances == instance
         plane = _under(tracks.xy[rows], tracks.visible[rows], ground, camera)
         share = _upright(z, ground, plane, tracks.xy[rows], tracks.visible[rows], camera)
         if share == 1:
             continue
         high = 0.0 if robot is None else _height(its, robot, plane, camera)
-        z = torch.where(its, (1 - high / plane.camera_m) / (share / z.clamp(min=1e-6) + (1 - share) / ground), z)
+        card = torch.where(z > 0, z, ground)  # at its edges depth of a network may be unknown
+        z = torch.where(its, (1 - high / plane.camera_m) / (share / card + (1 - share) / ground), z)
         lying.append(instance)
     return replace(depth, z=z, lying=frozenset(lying))
 
