@@ -1,5 +1,6 @@
 """Synthetic scenes as a LeRobot v3.0 dataset, written through LeRobot's own recording API."""
 
+import logging
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -10,6 +11,8 @@ import numpy as np
 from lerobot_msdyn.core.errors import ConfigError, OutputError
 from lerobot_msdyn.synthetic.choreography import STATE_NAMES
 from lerobot_msdyn.synthetic.scene import SyntheticScene, SyntheticView
+
+logger = logging.getLogger(__name__)
 
 IMAGE_DTYPES = ("video", "image")
 
@@ -99,12 +102,13 @@ def record(
         rgb_encoder=rgb_encoder,
         depth_encoder=DepthEncoderConfig(extra_options={"x265-params": "lossless=1:log-level=error"}),
     )
-    for scene, views in episodes:
+    for index, (scene, views) in enumerate(episodes):
         for t in range(len(scene)):
             dataset.add_frame(_frame(scene, views, features, t))
         with tamed_av1():
             # one process: forking beside the ray-caster's threads can hang
             dataset.save_episode(parallel_encoding=False)
+        logger.info("episode %d: %d frames recorded", index, len(scene))
     dataset.finalize()
     _remove_empty(root / "images")  # where LeRobot has kept frames until their videos were encoded
 
