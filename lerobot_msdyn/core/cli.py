@@ -132,7 +132,6 @@ def run_command(main: Callable[[list[str]], int], arguments: list[str] | None = 
     # Idle OpenMP threads would otherwise spin on the cores that the rasterizer needs. Read when torch is loaded, which
     # is why commands import it only when they run.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    os.environ.setdefault("HF_DATASETS_DISABLE_PROGRESS_BARS", "1")  # LeRobot's, of a tenth of a second
     shown = logging.StreamHandler(sys.stderr)
     shown.setFormatter(_Lines())
     logging.basicConfig(level=logging.INFO, handlers=[shown])
