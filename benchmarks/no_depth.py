@@ -15,15 +15,15 @@ from lerobot_msdyn.augment import __main__ as augment
 from lerobot_msdyn.core.perturbation import AMOUNTS, Perturbation, Viewpoint
 
 CAMERA = "observation.images.front"
-TURNS_DEG = (4.0, 12.0)  # one new episode each
-SHARE = 0.4  # of the episode: the frame that is shown
+TURNS_DEG = (-4.0, -12.0)  # one new episode each
+SHARE = 0.55  # of the episode: the frame that is shown
 WIDTH, HEIGHT, GAP = 400, 300, 6  # px
 
 
 @Perturbation.register_subclass("turns")
 @dataclass
 class Turns(Perturbation):
-    """Turn the camera to its right about what it looks at, each new episode by a given angle."""
+    """Turn the camera about what it looks at, each new episode by a given angle."""
 
     moves_rig: ClassVar[bool] = True
     allows_per_frame: ClassVar[bool] = False
