@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from lerobot_msdyn.core.cli import EXIT_OK, parse_config, run_command
 from lerobot_msdyn.core.errors import ConfigError, DatasetError
 from lerobot_msdyn.core.fields import between
+from lerobot_msdyn.dataset.named import lerobot_home
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDatasetMetadata
@@ -27,6 +28,8 @@ DIGITS = 6  # of the share that is passed to LeRobot
 class SplitConfig:
     """`python -m lerobot_msdyn.split`: flags for lerobot-train that hold out whole recordings."""
 
+    # Dataset, by its name in LeRobot's home (alias: --repo).
+    repo_id: str = ""
     # Exact folder of the dataset.
     root: Path | None = None
     # Share of each task's recordings that is held out.
@@ -120,10 +123,10 @@ def _held_out(train: int, eval_split: float) -> int:
 
 def run(arguments: list[str]) -> int:
     """Print flags for LeRobot's trainer; returns the exit code."""
-    config = parse_config(SplitConfig, arguments, {}, command=COMMAND)
-    if config.root is None:
-        raise ConfigError(f"which dataset? {COMMAND} --root FOLDER (see --help)")
-    split = split_by_source(config.root, config.eval_split)
+    config = parse_config(SplitConfig, arguments, {"repo": "repo_id"}, command=COMMAND)
+    if config.root is None and not config.repo_id:
+        raise ConfigError(f"which dataset? {COMMAND} --repo NAME or --root FOLDER (see --help)")
+    split = split_by_source(config.root or lerobot_home() / config.repo_id, config.eval_split)
     logger.info("%d episodes to train on, %d to evaluate on", len(split.train), len(split.evaluation))
     sys.stdout.write(" ".join(split.arguments) + "\n")
     return EXIT_OK

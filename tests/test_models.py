@@ -5,6 +5,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import httpx
 import pytest
 import torch
 from huggingface_hub import constants
@@ -88,13 +89,14 @@ def test_weights_that_are_not_those_are_named(machine: Path, name: str, capsys) 
         models.run(["fetch", name])
 
 
-def test_what_cannot_be_downloaded_is_said_in_a_line(machine: Path, monkeypatch) -> None:
+@pytest.mark.parametrize("kind", [OSError, httpx.ConnectError])  # the hub's library raises either
+def test_what_cannot_be_downloaded_is_said_in_a_line(machine: Path, monkeypatch, kind: type[Exception]) -> None:
     def no_network(*args: object, **kwargs: object) -> None:
-        raise OSError("no route\nto host")
+        raise kind("no route\nto host")
 
     monkeypatch.setattr(fetching, "snapshot_download", no_network)
     with pytest.raises(
-        PriorError, match=r"sam2 cannot be downloaded from facebook/\S+ \(OSError: no route\)"
+        PriorError, match=rf"sam2 cannot be downloaded from facebook/\S+ \({kind.__name__}: no route\)"
     ) as caught:
         models.run(["fetch", "sam2"])
     assert "\n" not in str(caught.value)

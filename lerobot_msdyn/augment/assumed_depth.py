@@ -7,7 +7,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 
 from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.core.config import PriorsConfig
-from lerobot_msdyn.core.errors import ConfigError
+from lerobot_msdyn.core.errors import ConfigError, PriorError
 from lerobot_msdyn.core.fields import AUTO
 from lerobot_msdyn.dataset.read import depth_key_of
 from lerobot_msdyn.priors.fetch import fetch, offline
@@ -37,7 +37,10 @@ def say_assumed_depth(source: LeRobotDatasetMetadata, cameras: Sequence[str], co
                 f"fetch_models is true, but {place} is no known model: fetch it with: hf download {place}"
             )
         demand_library(LIBRARY, EXTRA, f"the model {place}")
-        logger.info("depth by %s: %s", place, fetch(name))
+        try:
+            logger.info("depth by %s: %s", place, fetch(name))
+        except PriorError as error:
+            raise PriorError(f"{error}; without --fetch_models true depth is that of an assumed table plane") from error
         return
     assumed = "the table that the robot stands on"
     if config.camera.calibration is None:

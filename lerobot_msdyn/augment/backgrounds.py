@@ -42,18 +42,23 @@ Run = Callable[[Callable[[LeRobotDatasetMetadata, MaskTask], Any], list[MaskTask
 
 
 def shared_backgrounds(
-    source: LeRobotDatasetMetadata, cameras: list[str], recipe: Recipe, run: Run | None = None
+    source: LeRobotDatasetMetadata,
+    cameras: list[str],
+    recipe: Recipe,
+    run: Run | None = None,
+    say: Callable[[str], object] = lambda what: None,
 ) -> Backgrounds:
     """Per camera, what some of its episodes show together, fitted once; one for every place in which it stood.
 
     Episodes that cannot be read are left out here, and reported when it is their turn. `run` calls a function with the
-    source and each of some tasks, in this process or in others; by default in this one.
+    source and each of some tasks, in this process or in others; by default in this one. `say` is told what is done.
     """
     episodes = background_episodes(source, recipe)
     if not episodes:
         return {}
     views: dict[str, dict[tuple[int, int], View]] = {key: {} for key in cameras}  # by episode and stretch
     for index in episodes:
+        say(f"background: reading episode {index}")
         with contextlib.suppress(EpisodeError):
             episode, _ = read_recorded(source, index, cameras, recipe)
             for key, view in episode.views.items():
@@ -71,7 +76,10 @@ def shared_backgrounds(
             masks = (
                 (moving_in_episode(source, task) for task in tasks) if run is None else run(moving_in_episode, tasks)
             )
-            return map(torch.from_numpy, masks)
+            for task, mask in zip(tasks, masks, strict=True):
+                yield torch.from_numpy(mask)
+                say(f"background: what moves in episode {task.episode} is known")
+            say(f"background: fitting {key}")
 
         with torch_on_one_thread():
             backgrounds[key] = share_backgrounds(list(of_stands.values()), moving, recipe)

@@ -1,6 +1,7 @@
 """The progress bar of a run: what is being done, the share of the episodes that is done, and the time that is left."""
 
 import sys
+import time
 from io import TextIOBase
 from typing import Any
 
@@ -14,15 +15,20 @@ FORMAT = "{desc} |{bar}| {percentage:3.0f} % of {total} episodes [{elapsed}"
 class EpisodeBar(tqdm):
     """Counts episodes, in parts; tells the time left by the average, once enough is done. Use as a context."""
 
-    def __init__(self, total: int, stream: TextIOBase | None = None) -> None:
+    def __init__(self, total: int, stream: TextIOBase | None = None, *, what: str = "") -> None:
         file: Any = sys.stderr if stream is None else stream
         self._watched, self._episodes = file.isatty(), total
         interval_s = 0.1 if self._watched else UNWATCHED_S
-        super().__init__(total=total, file=file, bar_format=f"{FORMAT}]", mininterval=interval_s, smoothing=0)
+        super().__init__(
+            total=total, file=file, desc=what, bar_format=f"{FORMAT}]", mininterval=interval_s, smoothing=0
+        )
 
     def begin(self, what: str) -> None:
         """Say what is being done now."""
-        self.set_description_str(what, refresh=self._watched)
+        due = self._watched or time.time() - self.last_print_t >= UNWATCHED_S
+        self.set_description_str(what, refresh=due)
+        if due:
+            self.last_print_t = time.time()
 
     def advance(self, share: float) -> None:
         """Some share of an episode is done."""

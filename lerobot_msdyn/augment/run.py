@@ -70,14 +70,13 @@ def run_local(
     config, problems = prepared(source, episodes, cameras, config, output)
     failures: dict[int, str] = {}
     reasons: set[str] = set()
-    with logging_redirect_tqdm(), EpisodeBar(len(episodes)) as bar:
+    with logging_redirect_tqdm(), EpisodeBar(len(episodes), what="looking at the background") as bar:
 
         def progress(what: str, share: float) -> None:
             if what:
                 bar.begin(what)
             bar.advance(share)
 
-        bar.begin("looking at the background")
         work = Work(source, cameras, config, output, progress)
         for index, failure in attempts(work, episodes, problems):
             if failure is None:

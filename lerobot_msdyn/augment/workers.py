@@ -54,7 +54,9 @@ class Work:
         """What the episodes share, made once per run."""
 
         def make() -> Backgrounds:
-            return shared_backgrounds(self.source, self.cameras, self.config, self.run)
+            return shared_backgrounds(
+                self.source, self.cameras, self.config, self.run, lambda what: self.progress(what, 0.0)
+            )
 
         backgrounds: Backgrounds = self.output.staging.keep(BACKGROUNDS, make)
         return backgrounds

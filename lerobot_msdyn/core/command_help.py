@@ -10,6 +10,7 @@ from typing import Any
 import draccus
 from draccus.wrappers.docstring import get_attribute_docstring
 
+from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.recipe_files import packaged_recipes
 
 EXIT_CODES = (
@@ -46,11 +47,14 @@ def format_help(config_class: type, aliases: Mapping[str, str], command: str, re
     """The whole help: every field with its type, its default and the comment that stands above it."""
     names = ", ".join(f"--{alias} for --{name}" for alias, name in aliases.items() if alias != name)
     without = "" if recipe is None else f" (default: {recipe})"
-    head = (
-        f"usage: {command} [--field value ...]\n\n{inspect.getdoc(config_class)}\n\n"
+    recipes = (
         f"  --recipe NAME_OR_FILE{without}\n      A YAML file with any of the fields below, read before the flags; "
         f"by name: {_recipes()}.\n  --plugins MODULE_OR_FILE.py\n      Your own providers, motion levels, "
         f"perturbations or loss terms, imported before the recipe is read (docs/extending.md).\n\n"
+    )
+    head = (
+        f"usage: {command} [--field value ...]\n\n{inspect.getdoc(config_class)}\n\n"
+        f"{recipes if issubclass(config_class, Recipe) else ''}"
         f"{f'Short names: {names}.{chr(10)}' if names else ''}{EXIT_CODES}\n"
     )
     return head + "".join(_lines(config_class, ""))

@@ -57,7 +57,7 @@ class PriorCache:
         path = self.folder / f"{prior}-{provider}-{_digest(content.encode())}.npz"
         kept = _read(path)
         if kept is not None:
-            logger.info("%s: taken from %s", prior, path)
+            logger.debug("%s: taken from %s", prior, path)
             return kept
         arrays = compute()
         try:

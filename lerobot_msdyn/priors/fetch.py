@@ -6,7 +6,6 @@ from pathlib import Path
 
 import torch
 from huggingface_hub import hf_hub_download, snapshot_download
-from huggingface_hub.errors import HfHubHTTPError
 
 from lerobot_msdyn.core.errors import PriorError, first_line
 from lerobot_msdyn.core.files import BLOCK_BYTES
@@ -80,7 +79,7 @@ def _download(name: str, model: KnownModel) -> None:
         snapshot_download(model.place, revision=model.revision or None, allow_patterns=list(_NEEDED))
         if model.companion:
             hf_hub_download(model.companion, "config.json")
-    except (OSError, RuntimeError, ValueError, HfHubHTTPError) as error:
+    except Exception as error:  # several libraries take part, each with errors of its own
         raise PriorError(
             f"{name} cannot be downloaded from {model.place} ({first_line(error)}); is there a network? A copy from "
             "another machine serves as well"

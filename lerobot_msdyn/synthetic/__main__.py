@@ -5,12 +5,7 @@ import logging
 from pathlib import Path
 
 from lerobot_msdyn.core.cli import EXIT_OK, run_command
-from lerobot_msdyn.dataset.video import quiet_encoders
 from lerobot_msdyn.synthetic.choreography import KINDS
-from lerobot_msdyn.synthetic.dataset import write_dataset
-from lerobot_msdyn.synthetic.iphone import write_iphone_folder
-from lerobot_msdyn.synthetic.nvs import write_nvs_folder
-from lerobot_msdyn.synthetic.scene import make_scene
 
 logger = logging.getLogger("lerobot_msdyn.synthetic")
 
@@ -47,8 +42,12 @@ def _parser() -> argparse.ArgumentParser:
 
 def run(arguments: list[str]) -> int:
     """Make and write; returns the exit code."""
-    quiet_encoders()
     a = _parser().parse_args(arguments)
+    # seconds to import, and --help needs none of it
+    from lerobot_msdyn.dataset.video import quiet_encoders
+    from lerobot_msdyn.synthetic import make_scene, write_dataset, write_iphone_folder, write_nvs_folder
+
+    quiet_encoders()
     count = a.episodes if a.layout == "dataset" else 1
     scenes = [make_scene(a.kind, a.seed, a.frames, a.width, a.height, a.fps, episode=e) for e in range(count)]
     if a.layout == "dataset":

@@ -1,7 +1,9 @@
 """Synthetic scenes as a LeRobot v3.0 dataset, written through LeRobot's own recording API."""
 
+import contextlib
+import logging
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,8 @@ import numpy as np
 from lerobot_msdyn.core.errors import ConfigError, OutputError
 from lerobot_msdyn.synthetic.choreography import STATE_NAMES
 from lerobot_msdyn.synthetic.scene import SyntheticScene, SyntheticView
+
+logger = logging.getLogger(__name__)
 
 IMAGE_DTYPES = ("video", "image")
 
@@ -99,14 +103,29 @@ def record(
         rgb_encoder=rgb_encoder,
         depth_encoder=DepthEncoderConfig(extra_options={"x265-params": "lossless=1:log-level=error"}),
     )
-    for scene, views in episodes:
+    for index, (scene, views) in enumerate(episodes):
         for t in range(len(scene)):
             dataset.add_frame(_frame(scene, views, features, t))
-        with tamed_av1():
+        with tamed_av1(), _without_bars():
             # one process: forking beside the ray-caster's threads can hang
             dataset.save_episode(parallel_encoding=False)
+        logger.info("episode %d: %d frames recorded", index, len(scene))
     dataset.finalize()
     _remove_empty(root / "images")  # where LeRobot has kept frames until their videos were encoded
+
+
+@contextlib.contextmanager
+def _without_bars() -> Iterator[None]:
+    """LeRobot's own progress bars, of a tenth of a second each, are not shown."""
+    from datasets import are_progress_bars_disabled, disable_progress_bars, enable_progress_bars
+
+    shown = not are_progress_bars_disabled()
+    disable_progress_bars()
+    try:
+        yield
+    finally:
+        if shown:
+            enable_progress_bars()
 
 
 def _remove_empty(folder: Path) -> None:

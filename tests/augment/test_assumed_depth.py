@@ -95,6 +95,10 @@ def test_what_cannot_be_fetched_stops_the_run(fetched, caplog, monkeypatch) -> N
     def missing(*args: str) -> None:
         raise PriorError("needs transformers")
 
+    with monkeypatch.context() as without_network:
+        without_network.setattr(assumed_depth, "fetch", missing)
+        with pytest.raises(PriorError, match="; without --fetch_models true depth is that of an assumed table plane"):
+            said(caplog, AugmentConfig(fetch_models=True))
     monkeypatch.setattr(assumed_depth, "demand_library", missing)
     with pytest.raises(PriorError, match="needs transformers"):
         said(caplog, AugmentConfig(fetch_models=True))

@@ -4,7 +4,7 @@ import io
 
 import pytest
 
-from lerobot_msdyn.augment.progress import EpisodeBar
+from lerobot_msdyn.augment.progress import UNWATCHED_S, EpisodeBar
 
 
 def bar_after(elapsed_s: float, total: int, *shares: float) -> str:
@@ -44,3 +44,16 @@ def test_a_file_gets_few_lines(watched: bool) -> None:
         written = stream.getvalue()
         bar.begin("fitting")
         assert ("fitting" in stream.getvalue().removeprefix(written)) == watched
+
+
+def test_a_file_is_told_of_a_stage_that_begins_long_after_the_last_line() -> None:
+    stream = io.StringIO()
+    with EpisodeBar(4, stream, what="looking at the background") as bar:
+        assert stream.getvalue().strip().startswith("looking at the background |")
+        bar.begin("background: reading episode 3")
+        assert "reading" not in stream.getvalue()
+        bar.last_print_t -= UNWATCHED_S
+        bar.begin("background: reading episode 4")
+        bar.begin("background: reading episode 5")
+        assert "reading episode 4" in stream.getvalue()
+        assert "reading episode 5" not in stream.getvalue()

@@ -265,6 +265,7 @@ def test_no_help_shows_what_only_python_knows(command: str) -> None:
     assert "MISSING" not in text
     assert "<dataclasses" not in text
     assert "Short names: ." not in text
+    assert ("--recipe" in text) == issubclass(CONFIGS[COMMANDS[command]], Recipe)
 
 
 @pytest.mark.parametrize(

@@ -75,7 +75,7 @@ def test_auto_takes_what_is_at_hand_and_says_why(view: View, caplog: pytest.LogC
 
 def test_a_second_run_reads_what_the_first_has_kept(view: View, tmp_path: Path, caplog) -> None:
     first = estimate(view, cache=str(tmp_path))
-    with caplog.at_level(logging.INFO):
+    with caplog.at_level(logging.DEBUG):
         second = estimate(view, cache=str(tmp_path))
     assert sum("taken from" in record.message for record in caplog.records) == 2
     assert torch.equal(first.instances, second.instances)

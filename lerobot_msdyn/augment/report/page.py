@@ -56,7 +56,7 @@ pre{overflow-x:auto;font-size:13px}
 table{border-collapse:collapse;width:100%;font-size:14px;background:var(--paper)}
 th,td{text-align:left;padding:6px 10px;border-bottom:1px solid var(--line);white-space:nowrap}
 td.text{white-space:normal;min-width:220px;overflow-wrap:anywhere}
-th{color:var(--soft);font-weight:600}
+th{color:var(--soft);font-weight:600;white-space:normal}
 dl{display:grid;grid-template-columns:repeat(auto-fill,minmax(136px,1fr));gap:8px 16px;margin:14px 0 0}
 dl .wide{grid-column:span 2}
 dt{color:var(--soft);font-size:13px}dd{margin:0;font-weight:600}

@@ -1,4 +1,4 @@
-"""How the kernels of the CPU rasterizer are compiled: when first called, once per machine, kept on disk."""
+"""How the kernels of the CPU rasterizer are compiled: when first called, once per installation, kept on disk."""
 
 import hashlib
 import logging
@@ -58,7 +58,7 @@ class _CompileNotice(event.Listener):
                 return
             self._told = True
         _log.info(
-            "compiling the CPU rasterizer: this happens once per machine and takes up to a minute "
+            "compiling the CPU rasterizer: this happens once per installation and takes up to a minute "
             "(`python -m lerobot_msdyn.render.warmup` does it beforehand)"
         )
 
