@@ -22,7 +22,7 @@ from lerobot_msdyn.core.sampling import evenly, scaled_px
 from lerobot_msdyn.priors.registry import Depth, Masks
 
 UPRIGHT = (0.0, 0.25, 0.5, 0.75, 1.0)  # shares of the way from the ground to the depth so far, in inverse depth
-BETTER = 0.9  # of the error so far: as much a plane must lower it to
+BETTER = 0.9  # of the error so far: as much a plane must lower it to; what differs by less is as good
 MOST_PX = 1.5  # of 320, median: what is farther from where it must be does not slide
 FRAMES = 24  # that are compared
 LEAST_POINTS = 20
@@ -116,7 +116,7 @@ def _upright(
     visible: Bool[Tensor, "n t"],
     camera: CameraTrack,
 ) -> float:
-    """The share of `UPRIGHT` at which a thing that slides is seen where it must be; 1 where none is clearly better."""
+    """The least share of `UPRIGHT` at which a thing that slides is seen about where it must be; 1 where none is better."""
     frames = evenly(len(z), FRAMES)
     xy, visible = xy[:, frames], visible[:, frames]
     first = int(visible.sum(0).argmax())
@@ -137,9 +137,10 @@ def _upright(
             _slid_px(there[visible[:, k]], xy[visible[:, k], k], plane, camera) for k in usable.nonzero()[:, 0].tolist()
         ]
         errors[share] = float(torch.tensor(found).median())
-    best = min(errors, key=lambda share: errors[share])
-    slides = errors[best] < scaled_px(MOST_PX, camera.width)
-    return best if slides and errors[best] < BETTER * errors[1.0] else 1.0
+    least = min(errors.values())
+    flattest = next(share for share in UPRIGHT if BETTER * errors[share] <= least)
+    slides = errors[flattest] < scaled_px(MOST_PX, camera.width)
+    return flattest if slides and errors[flattest] < BETTER * errors[1.0] else 1.0
 
 
 def _slid_px(there: Float[Tensor, "n 3"], xy: Float[Tensor, "n 2"], plane: Ground, camera: CameraTrack) -> float:
