@@ -116,7 +116,7 @@ def _upright(
     visible: Bool[Tensor, "n t"],
     camera: CameraTrack,
 ) -> float:
-    """The least share of `UPRIGHT` at which a thing that slides is seen about where it must be; 1 where none is better."""
+    """The least share of `UPRIGHT` at which a thing that slides is seen where it must be; 1 where none is better."""
     frames = evenly(len(z), FRAMES)
     xy, visible = xy[:, frames], visible[:, frames]
     first = int(visible.sum(0).argmax())
