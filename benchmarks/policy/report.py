@@ -12,7 +12,7 @@ from .forms import Form
 from .score import BASE, BEST, Outcomes, share, success
 
 MOVED = "all moved"  # the group of all cameras but the recorded one
-WIDTH_PX, HEIGHT_PX, LEFT_PX, TOP_PX, KEY_PX = 860, 330, 40, 16, 200
+WIDTH_PX, HEIGHT_PX, LEFT_PX, TOP_PX, KEY_PX = 930, 330, 40, 16, 270
 COLOURS = ("#888888", "#c8641b", "#1f7a3d", "#8a3fa0", "#1f5fa8", "#b02a4a", "#9a8a10", "#3aa0a0")
 
 
