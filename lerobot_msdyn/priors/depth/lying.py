@@ -85,6 +85,8 @@ def with_lying(
             continue
         its = instances == instance
         plane = _under(tracks.xy[rows], tracks.visible[rows], ground, camera)
+        if plane is None:
+            continue
         share = _upright(z, ground, plane, tracks.xy[rows], tracks.visible[rows], camera)
         if share == 1:
             continue
@@ -102,10 +104,12 @@ def _rays(xy: Float[Tensor, "*n 2"], camera: CameraTrack) -> Float[Tensor, "*n 3
 
 def _under(
     xy: Float[Tensor, "n t 2"], visible: Bool[Tensor, "n t"], ground: Float[Tensor, "h w"], camera: CameraTrack
-) -> Ground:
-    """The ground where a thing is seen."""
+) -> Ground | None:
+    """The ground where a thing is seen; None where that is before the wall, which is assumed behind the ground."""
     seen = xy[visible]
-    return Ground.under(_rays(seen, camera) * ground[nearest_pixel(seen, camera.width, camera.height)][:, None])
+    depth = ground[nearest_pixel(seen, camera.width, camera.height)]
+    points = (_rays(seen, camera) * depth[:, None])[depth < ground.max()]
+    return Ground.under(points) if len(points) >= LEAST_POINTS else None
 
 
 def _upright(
