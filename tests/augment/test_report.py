@@ -119,6 +119,15 @@ def scored(db: float, cause: str) -> dict[str, Any]:
     return {"view": entry().view | {"scores": scores}}
 
 
+@pytest.mark.parametrize(("angle", "verdict"), [(4.0, "good"), (8.0, "doubtful")])
+def test_far_turns_on_assumed_depth_are_doubtful_whatever_their_score(angle: float, verdict: str) -> None:
+    view = entry().view | {"scores": SCORES | {"expected_db": 25.0, "angle_deg": angle}}
+    assert entry(view=view).verdict == "good"
+    assumed = entry(view=view, assumed=True)
+    assert assumed.verdict == verdict
+    assert ("depth is a guess" in summary([assumed])) == (verdict == "doubtful")
+
+
 def test_it_opens_with_what_is_good_and_what_would_make_the_rest_better() -> None:
     assert summary([]) == "No new views."
     assert summary([entry(**scored(25, "depth")), entry(**scored(20, "video"))]) == "2 of 2 views good."

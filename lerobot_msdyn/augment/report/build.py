@@ -109,20 +109,23 @@ def _origin(
 ) -> Origin:
     """What to say of how the dataset in `root` was made."""
     said: dict[str, None] = {}
-    assumed = False
     for episode in episodes:
         if episode.provenance.variant != SOURCE_VARIANT:
             for name, priors in episode.provenance.priors.items():
-                depth = priors.get("depth", {})
-                said[f"{name}: {_source_of(depth)}"] = None
-                assumed |= depth.get("provider") == ASSUMED_PROVIDER
+                said[f"{name}: {_source_of(priors.get('depth', {}))}"] = None
     versions = [f"{title} {importlib.metadata.version(name)}" for title, name in PACKAGES.items()]
     facts = {
         "source": f"{source.repo_id}, {source.total_episodes} episodes, {source.total_frames} frames",
         "depth": "; ".join(said),
         "made": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC, by {', '.join(versions)}",
     }
+    assumed = any(entry.assumed for entry in entries)
     return Origin(facts, assumed, _recipe(root), _sheets(entries), _links(root))
+
+
+def _is_assumed(priors: Mapping[str, Any]) -> bool:
+    """Whether depth is that of a plane at an assumed height and tilt, and not under a robot that the joints found."""
+    return priors.get("depth", {}).get("provider") == ASSUMED_PROVIDER and "robot" not in priors
 
 
 def _source_of(prior: Mapping[str, str]) -> str:
@@ -181,6 +184,7 @@ def entries_of(episodes: Iterable[NewEpisode]) -> Iterator[tuple[ViewEntry, int 
                     dropped,
                     sheet=episode.sheets.get(camera),
                     frame=episode.frames.get(camera),
+                    assumed=_is_assumed(origin.priors.get(camera, {})),
                 )
                 yield entry, None if dropped else index
         index += not episode.dropped

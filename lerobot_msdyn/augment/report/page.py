@@ -12,6 +12,7 @@ from lerobot_msdyn.reconstruction.account import Account, account_sentence, pool
 
 LISTED = 1000  # rows of the table, at most
 GOOD_DB = 20.0  # expected; below it a view is doubtful (docs/views.md has how often the score is right there)
+ASSUMED_DEG = 5.0  # a view turned by more is doubtful where depth is assumed: it harms policies (docs/results.md)
 SHOWN_POSES = 8  # of a camera that moves along the episode, about
 TOLD_PX = 1.5  # of 320: a camera that drifts or is displaced by less is not named
 STYLE = """
@@ -130,6 +131,7 @@ class ViewEntry:
     pair: str | None = None  # of a dropped view: a frame of it beside the recorded one, as a data URL
     sheet: Path | None = None  # the priors of its episode
     frame: Path | None = None  # of a dropped view
+    assumed: bool = False  # whether its depth is that of a plane that nobody has measured
 
     @property
     def scores(self) -> dict[str, Any] | None:
@@ -148,7 +150,12 @@ class ViewEntry:
             return "dropped"
         if self.scores is None:
             return "not judged"
-        return "good" if self.score >= GOOD_DB else "doubtful"
+        return "good" if self.score >= GOOD_DB and not self.too_far else "doubtful"
+
+    @property
+    def too_far(self) -> bool:
+        """Whether it is turned by more than assumed depth allows."""
+        return self.assumed and self.scores is not None and self.scores["angle_deg"] > ASSUMED_DEG
 
 
 @dataclass(frozen=True)
@@ -224,6 +231,8 @@ def summary(entries: Sequence[ViewEntry]) -> str:
     if not doubtful:
         return f"{opening}."
     cause = max(ADVICE, key=lambda name: sum(causes.get(name, 0.0) for causes in doubtful))
+    if any(entry.too_far for entry in entries):
+        cause = "depth"
     return f"{opening}: {ADVICE[cause]}."
 
 

@@ -13,9 +13,9 @@ from lerobot_msdyn.core.geometry import unproject_image
 
 type Ground = Float[Tensor, "h w"]
 
-# Distance of the wall behind the table, in distances to the table at the image's centre. Half of what is nearer than a
-# farther wall would be, as shelves and monitors are, is then placed about right (benchmarks/notes/priors.md).
-WALL = 2.0
+# Distance of the wall behind the table, in distances to the table at the image's centre: shelves and monitors are nearer,
+# rooms farther (benchmarks/notes/priors.md).
+_WALL = 2.0
 _LOWEST = 0.98  # quantile of an instance's rows where it touches the table; the very last ones may be stray pixels
 _SMOOTH_FRAMES = 9  # of the temporal smoothing of an instance's distance
 
@@ -28,7 +28,7 @@ def table_plane(width: int, height: int, intrinsics: Float[Tensor, "3 3"], heigh
     tilt = math.radians(tilt_deg)
     y = (torch.arange(height) + 0.5 - intrinsics[1, 2].cpu()) / intrinsics[1, 1].cpu()
     descent = y * math.cos(tilt) + math.sin(tilt)  # of a ray, per metre of z
-    wall = WALL * height_m / math.sin(tilt)
+    wall = _WALL * height_m / math.sin(tilt)
     rows = torch.where(descent > height_m / wall, height_m / descent.clamp(min=1e-6), wall)
     return rows[:, None].repeat(1, width)
 
@@ -40,7 +40,7 @@ def ground_plane(camera: CameraTrack, ground_m: float) -> Ground:
     descent = -(rays @ pose[2, :3])  # per metre of z
     above = (pose[2, 3] - ground_m).clamp(min=1e-3)
     centre = descent[camera.height // 2, camera.width // 2].clamp(min=0.1)
-    wall = WALL * above / centre
+    wall = _WALL * above / centre
     return torch.where(descent > above / wall, above / descent.clamp(min=1e-6), wall)
 
 
