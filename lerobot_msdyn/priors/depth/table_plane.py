@@ -13,8 +13,8 @@ from lerobot_msdyn.core.geometry import unproject_image
 
 type Ground = Float[Tensor, "h w"]
 
-# Distance of the wall behind the table, in distances to the table at the image's centre: shelves and monitors are nearer,
-# rooms farther (benchmarks/notes/priors.md).
+# Distance of the wall behind the table, in distances to the table at the image's centre: shelves and monitors are
+# nearer, rooms farther (benchmarks/notes/priors.md).
 _WALL = 2.0
 _LOWEST = 0.98  # quantile of an instance's rows where it touches the table; the very last ones may be stray pixels
 _SMOOTH_FRAMES = 9  # of the temporal smoothing of an instance's distance
