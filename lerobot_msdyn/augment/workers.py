@@ -24,6 +24,7 @@ from tqdm import tqdm
 from lerobot_msdyn.augment.backgrounds import Backgrounds, MaskTask, Run, shared_backgrounds
 from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.augment.episode import Progress
+from lerobot_msdyn.core.cli import quiet_libraries
 from lerobot_msdyn.core.plugins import import_plugins, imported_plugins
 from lerobot_msdyn.core.processes import Processes
 from lerobot_msdyn.dataset.read import open_source
@@ -150,6 +151,7 @@ def _begin(place: _Place, threads: int, progress: Progress) -> Work:
     """Make a new process a worker."""
     for said_by_parent in (chosen_device, open_source):
         logging.getLogger(said_by_parent.__module__).setLevel(logging.ERROR)
+    quiet_libraries()
     config = _config_at(place)
     for each in _talkative(config):
         each.setLevel(logging.WARNING)

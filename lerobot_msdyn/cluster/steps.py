@@ -12,6 +12,7 @@ from datatrove.pipeline.base import PipelineStep
 from datatrove.utils.logging import logger as engine_log
 
 from lerobot_msdyn.cluster.task import read_job, say_error
+from lerobot_msdyn.core.cli import quiet_libraries
 from lerobot_msdyn.core.errors import MsdynError, WorkerError, first_line, one_line
 
 if TYPE_CHECKING:
@@ -113,8 +114,7 @@ class logged_by_the_engine:  # noqa: N801  # a context, used as a function
     def __enter__(self) -> None:
         self._before = logging.root.handlers, logging.root.level
         logging.root.handlers, logging.root.level = [_Forward()], logging.INFO
-        for name in ("lerobot", "httpx", "fsspec", "botocore"):
-            logging.getLogger(name).setLevel(logging.WARNING)
+        quiet_libraries()
 
     def __exit__(self, *_: object) -> None:
         logging.root.handlers, logging.root.level = self._before

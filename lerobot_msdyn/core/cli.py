@@ -123,6 +123,12 @@ def _item_of(hint: object) -> Any:
     return None
 
 
+def quiet_libraries() -> None:
+    """Libraries that say at length what they do (codecs, requests) only warn from now on, in this process."""
+    for name in ("lerobot", "httpx", "fsspec", "botocore"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+
+
 def run_command(main: Callable[[list[str]], int], arguments: list[str] | None = None) -> None:
     """Run a command, report expected errors in one line, and exit.
 
@@ -135,8 +141,7 @@ def run_command(main: Callable[[list[str]], int], arguments: list[str] | None = 
     shown = logging.StreamHandler(sys.stderr)
     shown.setFormatter(_Lines())
     logging.basicConfig(level=logging.INFO, handlers=[shown])
-    for name in ("lerobot", "httpx"):
-        logging.getLogger(name).setLevel(logging.WARNING)
+    quiet_libraries()
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments == ["--version"]:
         sys.stdout.write(f"lerobot_msdyn {version('lerobot_msdyn')}\n")
