@@ -2,6 +2,7 @@
 
 import filecmp
 import json
+import logging
 import os
 import pickle
 import signal
@@ -116,9 +117,14 @@ def forgotten(plugin: Path) -> None:
     plugins._imported.pop(str(plugin))
 
 
-def test_workers_use_a_plugin_of_the_run(desk: Path, tmp_path: Path, plugin: Path) -> None:
+def test_workers_use_a_plugin_of_the_run(
+    desk: Path, tmp_path: Path, plugin: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
     flags = ("--plugins", str(plugin), "--priors.depth", "far_wall", "--workers", "2", "--episodes", "[0,1]")
     assert augment.run(command(desk, tmp_path / "new", *flags)) == 0
+    assert "rendered by motion" in caplog.text  # as workers say
+    assert "video codec" not in caplog.text  # as LeRobot says in them
     rows = pq.read_table(tmp_path / "new" / "meta" / "msdyn" / "episodes.parquet").to_pylist()
     made = [json.loads(row["priors"]) for row in rows if row["variant"] >= 0]
     assert [priors["observation.images.front"]["depth"]["provider"] for priors in made] == ["far_wall"] * 2
