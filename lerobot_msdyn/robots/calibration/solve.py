@@ -32,7 +32,7 @@ WIDE, WIDER_PX = Spread(offset_deg=4.0, scale=0.06, noise_deg=1.0), 2.0
 LEAST_GAIN = 0.015  # of the share of hits, by which corrected joints must fit better
 LEAST_HITS = 0.6  # share of the outlines that lie on edges
 LEAST_MARGIN = 0.04  # by which another camera must fit worse
-MOST_FOCAL_SD = 0.05
+MOST_FOCAL_SD, MOST_TURN_SD_DEG = 0.05, 0.9
 OTHER_DEG, OTHER_SHARE = 12.0, 0.3  # what another camera is
 
 
@@ -215,7 +215,12 @@ def _doubt(solution: Solution, share: float, margin: float) -> str:
         return f"only {share:.0%} of the links' outlines lie where something moves (at least {LEAST_HITS:.0%})"
     if margin < LEAST_MARGIN:
         return "another camera fits as well"
-    deviation = np.inf if solution.covariance is None else float(np.sqrt(solution.covariance[6, 6]))
-    if deviation > MOST_FOCAL_SD:
-        return f"the focal length is uncertain by {deviation:.0%}"
+    if solution.covariance is None:
+        return "nothing tells how uncertain the camera is"
+    focal = float(np.sqrt(solution.covariance[6, 6]))
+    if focal > MOST_FOCAL_SD:
+        return f"the focal length is uncertain by {focal:.0%}"
+    turn_deg = math.degrees(math.sqrt(np.trace(solution.covariance[:3, :3])))
+    if turn_deg > MOST_TURN_SD_DEG:
+        return f"its direction is uncertain by {turn_deg:.1f} degrees"
     return ""
