@@ -32,7 +32,7 @@ WIDE, WIDER_PX = Spread(offset_deg=4.0, scale=0.06, noise_deg=1.0), 2.0
 LEAST_GAIN = 0.015  # of the share of hits, by which corrected joints must fit better
 LEAST_HITS = 0.6  # share of the outlines that lie on edges
 LEAST_MARGIN = 0.04  # by which another camera must fit worse
-MOST_FOCAL_SD, MOST_TURN_SD_DEG = 0.05, 0.9
+MOST_FOCAL_SD, MOST_TURN_SD_DEG = 0.05, 0.7
 OTHER_DEG, OTHER_SHARE = 12.0, 0.3  # what another camera is
 
 
