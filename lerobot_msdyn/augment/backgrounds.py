@@ -40,25 +40,29 @@ class MaskTask:
 
 Run = Callable[[Callable[[LeRobotDatasetMetadata, MaskTask], Any], list[MaskTask]], Iterable[Any]]
 
+READING = 0.2  # share of the time that reading takes
+WORTH = 0.2  # of an episode's whole work, that looking at one of the background's takes
+
 
 def shared_backgrounds(
     source: LeRobotDatasetMetadata,
     cameras: list[str],
     recipe: Recipe,
     run: Run | None = None,
-    say: Callable[[str], object] = lambda what: None,
+    say: Callable[[str, float], object] = lambda what, share: None,
 ) -> Backgrounds:
     """Per camera, what some of its episodes show together, fitted once; one for every place in which it stood.
 
     Episodes that cannot be read are left out here, and reported when it is their turn. `run` calls a function with the
-    source and each of some tasks, in this process or in others; by default in this one. `say` is told what is done.
+    source and each of some tasks, in this process or in others; by default in this one. `say` is told
+    what is being done, and the share of all of it that is done since.
     """
     episodes = background_episodes(source, recipe)
     if not episodes:
         return {}
     views: dict[str, dict[tuple[int, int], View]] = {key: {} for key in cameras}  # by episode and stretch
     for index in episodes:
-        say(f"background: reading episode {index}")
+        say(f"background: reading episode {index}", READING / len(episodes))
         with contextlib.suppress(EpisodeError):
             episode, _ = read_recorded(source, index, cameras, recipe)
             for key, view in episode.views.items():
@@ -78,8 +82,11 @@ def shared_backgrounds(
             )
             for task, mask in zip(tasks, masks, strict=True):
                 yield torch.from_numpy(mask)
-                say(f"background: what moves in episode {task.episode} is known")
-            say(f"background: fitting {key}")
+                say(
+                    f"background: what moves in episode {task.episode} is known",
+                    (1 - READING) / len(cameras) / len(tasks),
+                )
+            say(f"background: fitting {key}", 0.0)
 
         with torch_on_one_thread():
             backgrounds[key] = share_backgrounds(list(of_stands.values()), moving, recipe)
@@ -103,6 +110,11 @@ def background_episodes(source: LeRobotDatasetMetadata, recipe: Recipe) -> list[
     if not recipe.scene.shared_background or source.total_episodes < 2:
         return []
     return looked_at(source.total_episodes)
+
+
+def background_worth(source: LeRobotDatasetMetadata, recipe: Recipe) -> float:
+    """As many episodes as what `shared_backgrounds` takes as long as, about."""
+    return WORTH * len(background_episodes(source, recipe))
 
 
 def looked_at(episodes: int) -> list[int]:

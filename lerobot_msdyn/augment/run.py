@@ -11,7 +11,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from lerobot_msdyn.augment.assumed_depth import say_assumed_depth
-from lerobot_msdyn.augment.backgrounds import background_episodes
+from lerobot_msdyn.augment.backgrounds import background_episodes, background_worth
 from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.augment.episode import augment_episode
 from lerobot_msdyn.augment.failures import same_reason
@@ -25,6 +25,7 @@ from lerobot_msdyn.core.fields import AUTO
 from lerobot_msdyn.dataset.convert import named_as_given
 from lerobot_msdyn.dataset.provenance import CALIBRATION
 from lerobot_msdyn.dataset.rows import files_problem
+from lerobot_msdyn.dataset.staging import BACKGROUNDS
 from lerobot_msdyn.dataset.write import NewEpisode, OutputDataset
 from lerobot_msdyn.priors.estimate import check_named_providers
 from lerobot_msdyn.render.devices import chosen_device
@@ -70,7 +71,8 @@ def run_local(
     config, problems = prepared(source, episodes, cameras, config, output)
     failures: dict[int, str] = {}
     reasons: set[str] = set()
-    with logging_redirect_tqdm(), EpisodeBar(len(episodes), what="looking at the background") as bar:
+    before = 0.0 if output.staging.has(BACKGROUNDS) else background_worth(source, config)
+    with logging_redirect_tqdm(), EpisodeBar(len(episodes), what="looking at the background", before=before) as bar:
 
         def progress(what: str, share: float) -> None:
             if what:
@@ -86,7 +88,7 @@ def run_local(
             if reason not in reasons:
                 reasons.add(reason)
                 logger.error("skipped: %s", failures[index])
-        bar.advance(float(len(episodes)))
+        bar.advance(before + len(episodes))
     return failures
 
 

@@ -21,7 +21,7 @@ import torch
 from lerobot.datasets import LeRobotDatasetMetadata
 from tqdm import tqdm
 
-from lerobot_msdyn.augment.backgrounds import Backgrounds, MaskTask, Run, shared_backgrounds
+from lerobot_msdyn.augment.backgrounds import Backgrounds, MaskTask, Run, background_worth, shared_backgrounds
 from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.augment.episode import Progress
 from lerobot_msdyn.core.cli import quiet_libraries
@@ -55,8 +55,9 @@ class Work:
         """What the episodes share, made once per run."""
 
         def make() -> Backgrounds:
+            worth = background_worth(self.source, self.config)
             return shared_backgrounds(
-                self.source, self.cameras, self.config, self.run, lambda what: self.progress(what, 0.0)
+                self.source, self.cameras, self.config, self.run, lambda what, share: self.progress(what, share * worth)
             )
 
         backgrounds: Backgrounds = self.output.staging.keep(BACKGROUNDS, make)

@@ -29,6 +29,15 @@ def test_then_it_is_told_by_the_average_since_the_start() -> None:
     assert bar_after(60, 8, *[0.001] * 800).endswith(" 10 % of 8 episodes [01:00<09:00]")
 
 
+def test_work_before_the_episodes_counts() -> None:
+    with EpisodeBar(4, io.StringIO(), what="looking at the background", before=1.0) as bar:
+        bar.start_t -= 60
+        bar.advance(0.5)
+        assert " 10 % of 4 episodes [01:00<09:00]" in str(bar)
+        bar.advance(4.5)
+        assert "100 % of 4 episodes" in str(bar)
+
+
 def test_shares_that_add_up_to_more_end_at_the_total() -> None:
     assert bar_after(60, 1, 0.7, 0.7).endswith("100 % of 1 episodes [01:00<00:00]")
 
