@@ -6,19 +6,17 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float64
 from lerobot.datasets import LeRobotDatasetMetadata
 from numpy import ndarray
 
-from lerobot_msdyn.augment.robot_cameras import described, joints_of, states_of
+from lerobot_msdyn.augment.robot_cameras import described, joints_of, small_pictures, states_of
 from lerobot_msdyn.core.config import RobotConfig
 from lerobot_msdyn.core.errors import ConfigError, DatasetError, EpisodeError
-from lerobot_msdyn.core.sampling import REFERENCE_WIDTH, evenly
+from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.dataset.checks import picture_size
-from lerobot_msdyn.dataset.read import read_colour
 from lerobot_msdyn.dataset.rows import read_rows
 from lerobot_msdyn.priors.exchange import Exchange, write_exchange
 from lerobot_msdyn.robots.calibration.hand_eye import HandEye, solve_hand_eye
@@ -89,20 +87,10 @@ def riding_camera(
     videos, links = [], []
     for episode in (known[int(k)] for k in evenly(len(known), max_episodes)):
         with contextlib.suppress(EpisodeError):
-            videos.append(_video(source, episode, key))
+            rows = read_rows(source, episode)
+            videos.append(np.stack(small_pictures(source, episode, key, rows, range(min(len(rows), FRAMES)))))
             links.append(poses[episode][: len(videos[-1])])
     if not videos:
         raise DatasetError(f"{source.repo_id}: the video of {key} can be read in no episode")
     eye = solve_hand_eye(videos, links, source.fps)
     return RidingCamera(key, link, eye, videos[0].shape[2], source.fps, poses)
-
-
-def _video(source: LeRobotDatasetMetadata, episode: int, key: str) -> UInt8[ndarray, "t h w 3"]:
-    """The first frames, at most 320 wide."""
-    rows = read_rows(source, episode)
-    rgb = read_colour(source, episode, key, rows, list(range(min(len(rows), FRAMES)))).numpy()
-    height, width = rgb.shape[1:3]
-    if width <= REFERENCE_WIDTH:
-        return rgb
-    size = (REFERENCE_WIDTH, round(height * REFERENCE_WIDTH / width))
-    return np.stack([cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in rgb])

@@ -11,6 +11,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pyarrow as pa
 from jaxtyping import Float64, UInt8
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import OBS_STATE
@@ -386,15 +387,26 @@ def _pictures(source: LeRobotDatasetMetadata, key: str, frames: Frames) -> tuple
     pictures = []
     for index, chosen in frames.items():
         try:
-            rgb = read_colour(source, index, key, read_rows(source, index), chosen).numpy()
+            pictures += small_pictures(source, index, key, read_rows(source, index), chosen)
         except EpisodeError as error:
             logger.info("%s", error)
             continue
         readable[index] = chosen
-        height, width = rgb.shape[1:3]
-        size = (min(width, REFERENCE_WIDTH), round(height * min(1.0, REFERENCE_WIDTH / width)))
-        pictures += [cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in rgb]
     return readable, np.stack(pictures) if pictures else np.zeros((0, 1, 1, 3), np.uint8)
+
+
+def small_pictures(
+    source: LeRobotDatasetMetadata, episode: int, key: str, rows: pa.Table, frames: Sequence[int]
+) -> list[UInt8[ndarray, "h w 3"]]:
+    """Frames of a camera, at most 320 wide.
+
+    Raises:
+        EpisodeError: they cannot be read.
+    """
+    rgb = read_colour(source, episode, key, rows, frames).numpy()
+    height, width = rgb.shape[1:3]
+    size = (min(width, REFERENCE_WIDTH), round(height * min(1.0, REFERENCE_WIDTH / width)))
+    return [cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in rgb]
 
 
 def _mappings(robot: Robot, mapping: JointMap, states: States, config: RobotConfig) -> list[JointMap]:

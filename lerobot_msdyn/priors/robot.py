@@ -72,14 +72,12 @@ def _held(
 
     What is about as far away already stays where it is: it may stand on the table.
     """
-    window = np.ones((2 * max(1, round(scaled_px(TOUCHING_PX, others.shape[1]))) + 1,) * 2, np.uint8)
     for index in others.unique().tolist():
         its = others == index
-        grown = torch.from_numpy(cv2.dilate(its.numpy().astype(np.uint8), window) > 0)
-        touched = links[grown & (links > 0)]
+        touched = links[with_touching(its) & (links > 0)]
         if not index or len(touched) < LEAST_TOUCHED:
             continue
-        beside = torch.from_numpy(cv2.dilate((links > 0).numpy().astype(np.uint8), window) > 0) & its & (depth > 0)
+        beside = with_touching(links > 0) & its & (depth > 0)
         if not bool(beside.any()):
             depth = torch.where(its, touched.median(), depth)
             continue
@@ -87,6 +85,12 @@ def _held(
         if abs(float(factor.log())) > SAME_DEPTH:
             depth = torch.where(its, factor * depth, depth)
     return depth
+
+
+def with_touching(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+    """A mask, and the pixels that are close enough for what they show to touch it."""
+    window = np.ones((2 * max(1, round(scaled_px(TOUCHING_PX, mask.shape[1]))) + 1,) * 2, np.uint8)
+    return torch.from_numpy(cv2.dilate(mask.numpy().astype(np.uint8), window) > 0)
 
 
 def _spread(depth: Float[Tensor, "h w"], mask: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:

@@ -48,6 +48,9 @@ def grid(rows: Tensor, columns: Tensor) -> Tensor:
     return torch.stack(torch.meshgrid(rows, columns, indexing="ij"), -1).reshape(-1, 2)
 
 
+FLAT = torch.cat((grid(torch.linspace(-0.1, 0.1, 18), torch.linspace(-0.05, 0.05, 10)), torch.zeros(180, 1)), 1)
+
+
 def depths(shape: Tensor, turning: float = 0.12, lift: float = 0.0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Pixels of the thing, and depth there: on the ground, standing, and as its motion says."""
     tracks, masks = filmed(shape, turning, lift)
@@ -60,8 +63,7 @@ def depths(shape: Tensor, turning: float = 0.12, lift: float = 0.0) -> tuple[Ten
 
 
 def test_what_slides_about_on_its_face_lies_on_the_ground() -> None:
-    flat = torch.cat((grid(torch.linspace(-0.1, 0.1, 18), torch.linspace(-0.05, 0.05, 10)), torch.zeros(180, 1)), 1)
-    _, ground, standing, found = depths(flat)
+    _, ground, standing, found = depths(FLAT)
     before, after = (float((z / ground - 1).abs().median()) for z in (standing, found))
     assert before > 0.06
     assert after < 0.4 * before
@@ -69,8 +71,7 @@ def test_what_slides_about_on_its_face_lies_on_the_ground() -> None:
 
 @pytest.mark.parametrize("thick", [0.0, 0.03])
 def test_a_robot_that_touches_it_tells_how_thick_it_is(thick: float) -> None:
-    flat = torch.cat((grid(torch.linspace(-0.1, 0.1, 18), torch.linspace(-0.05, 0.05, 10)), torch.zeros(180, 1)), 1)
-    tracks, masks = filmed(flat + torch.tensor([0.0, 0.0, thick]))
+    tracks, masks = filmed(FLAT + torch.tensor([0.0, 0.0, thick]))
     ground = table_plane(WIDTH, HEIGHT, K, CAMERA_M, TILT_DEG)
     top = table_plane(WIDTH, HEIGHT, K, CAMERA_M - thick, TILT_DEG)
     touching = torch.zeros_like(masks, dtype=torch.bool)
@@ -89,8 +90,7 @@ def test_a_robot_that_touches_it_tells_how_thick_it_is(thick: float) -> None:
 
 
 def test_what_is_lifted_is_not_laid_down() -> None:
-    flat = torch.cat((grid(torch.linspace(-0.1, 0.1, 18), torch.linspace(-0.05, 0.05, 10)), torch.zeros(180, 1)), 1)
-    _, _, standing, found = depths(flat, lift=0.02)
+    _, _, standing, found = depths(FLAT, lift=0.02)
     torch.testing.assert_close(found, standing)
 
 

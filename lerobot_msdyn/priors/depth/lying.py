@@ -9,17 +9,16 @@ the robot that touches it, if at all.
 
 from dataclasses import dataclass, replace
 
-import cv2
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.core.geometry import nearest_pixel, pixel_grid
+from lerobot_msdyn.core.geometry import nearest_pixel, project, unproject, unproject_image
 from lerobot_msdyn.core.observations import PointTracks, RobotSeen
 from lerobot_msdyn.core.sampling import evenly, scaled_px
 from lerobot_msdyn.priors.registry import Depth, Masks
+from lerobot_msdyn.priors.robot import LEAST_TOUCHED, with_touching
 
 UPRIGHT = (0.0, 0.25, 0.5, 0.75, 1.0)  # shares of the way from the ground to the depth so far, in inverse depth
 BETTER = 0.9  # of the error so far: as much a plane must lower it to; what differs by less is as good
@@ -29,8 +28,7 @@ LEAST_POINTS = 20
 LEAST_SEEN = 8  # points that a frame must share with the one in which most are seen
 MOVED_PX = 3.0  # of 320, median: frames in which a thing is nearer to that place tell nothing
 OUTLIERS = 3.0  # times the median error beyond which a point does not count
-TOUCHING_PX = 1.5  # of 320: no farther apart are things that touch
-LEAST_TOUCHED, LEAST_TOUCHES = 8, 3  # pixels in a frame, and frames
+LEAST_TOUCHES = 3  # frames in which the robot must touch a thing
 LOWEST = 0.2  # quantile of the heights of the links' pixels where they touch: of each frame, and over frames
 MOST_SHARE = 0.2  # of the camera's height that a thing that lies may be high
 
@@ -97,18 +95,13 @@ def with_lying(
     return replace(depth, z=z, lying=frozenset(lying))
 
 
-def _rays(xy: Float[Tensor, "*n 2"], camera: CameraTrack) -> Float[Tensor, "*n 3"]:
-    """To pixels, of z-depth 1, in the camera's axes."""
-    return torch.cat((xy, torch.ones_like(xy[..., :1])), -1) @ torch.linalg.inv(camera.intrinsics[0]).T
-
-
 def _under(
     xy: Float[Tensor, "n t 2"], visible: Bool[Tensor, "n t"], ground: Float[Tensor, "h w"], camera: CameraTrack
 ) -> Ground | None:
     """The ground where a thing is seen; None where that is before the wall, which is assumed behind the ground."""
     seen = xy[visible]
     depth = ground[nearest_pixel(seen, camera.width, camera.height)]
-    points = (_rays(seen, camera) * depth[:, None])[depth < ground.max()]
+    points = unproject(seen, depth, camera.intrinsics[0])[depth < ground.max()]
     return Ground.under(points) if len(points) >= LEAST_POINTS else None
 
 
@@ -136,7 +129,8 @@ def _upright(
         return 1.0
     errors = {}
     for share in UPRIGHT:
-        there = plane.coordinates(_rays(xy[:, first], camera) / (share / own + (1 - share) / under)[:, None])
+        z_share = 1 / (share / own + (1 - share) / under)
+        there = plane.coordinates(unproject(xy[:, first], z_share, camera.intrinsics[0]))
         found = [
             _slid_px(there[visible[:, k]], xy[visible[:, k], k], plane, camera) for k in usable.nonzero()[:, 0].tolist()
         ]
@@ -156,7 +150,7 @@ def _slid_px(there: Float[Tensor, "n 3"], xy: Float[Tensor, "n 2"], plane: Groun
         plane: the ground.
         camera: that sees them.
     """
-    rays = _rays(xy, camera) @ plane.axes.T
+    rays = unproject(xy, torch.ones(len(xy)), camera.intrinsics[0]) @ plane.axes.T
     above = plane.camera_m - there[:, 2]
     eye = plane.coordinates(torch.zeros(3))
     now = eye[:2] + rays[:, :2] * (above / -rays[:, 2].clamp(max=-1e-6))[:, None]
@@ -169,23 +163,20 @@ def _slid_px(there: Float[Tensor, "n 3"], xy: Float[Tensor, "n 2"], plane: Groun
         cosine, sine = dot / torch.hypot(dot, cross), cross / torch.hypot(dot, cross)
         turn = torch.stack((torch.stack((cosine, sine)), torch.stack((-sine, cosine))))
         moved = a @ turn + (share * now).sum(0)
-        seen = plane.points(torch.cat((moved, there[:, 2:]), 1)) @ camera.intrinsics[0].T
-        away = (seen[:, :2] / seen[:, 2:].clamp(min=1e-6) - xy).norm(dim=-1)
+        seen, _ = project(plane.points(torch.cat((moved, there[:, 2:]), 1)), camera.intrinsics[0])
+        away = (seen - xy).norm(dim=-1)
         weights = (away <= OUTLIERS * away.median()).float()
     return float(away.median())
 
 
 def _height(its: Bool[Tensor, "t h w"], robot: RobotSeen, plane: Ground, camera: CameraTrack) -> float:
     """How high above the ground the robot touches a thing, at the lowest (m): it is at least about as thick."""
-    window = np.ones((2 * max(1, round(scaled_px(TOUCHING_PX, camera.width))) + 1,) * 2, np.uint8)
-    rays = _rays(pixel_grid(camera.height, camera.width), camera)
     heights = []
     for mask, depth, moving in zip(its, robot.depth, robot.moving, strict=True):
-        grown = torch.from_numpy(cv2.dilate(mask.numpy().astype(np.uint8), window) > 0)
-        touched = grown & ~mask & moving & (depth > 0)
+        touched = with_touching(mask) & ~mask & moving & (depth > 0)
         if int(touched.sum()) >= LEAST_TOUCHED:
-            height = plane.coordinates(rays[touched] * depth[touched][:, None])[:, 2]
-            heights.append(height.quantile(LOWEST))
+            points = unproject_image(depth, camera.intrinsics[0])[touched]
+            heights.append(plane.coordinates(points)[:, 2].quantile(LOWEST))
     if len(heights) < LEAST_TOUCHES:
         return 0.0
     return float(torch.stack(heights).quantile(LOWEST).clamp(0, MOST_SHARE * plane.camera_m))

@@ -11,7 +11,7 @@ from lerobot_msdyn.robots.calibration.search import Pose
 from lerobot_msdyn.robots.description import Robot
 from lerobot_msdyn.robots.kinematics import link_poses
 
-NAMES = re.compile(r"cam(era)?(_|$|\d)|optical|realsense|d4[0-9]{2}|zed|oak", re.IGNORECASE)
+NAMES = re.compile(r"(^|_)(cam(era)?|optical|realsense|d4\d\d|zed|oak)(_|\d|$)", re.IGNORECASE)
 FOVS_DEG = (45, 56, 70)  # horizontal
 AXES_FROM_OPTICAL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # of links whose x axis looks ahead (ROS REP 103)
 STILL_M = 0.002  # by which a link may move and its camera be fixed
