@@ -246,30 +246,37 @@ ROWS: dict[str, Row] = {
 }
 
 
+_many = partial(product, flags=(*WITH_JOINTS, "--variants=6"), wide=True)  # whose first n are those of n
+
+
 def _swept(name: str, field: str, values: Iterable[Any]) -> dict[str, Row]:
-    """Rows of the product with one flag changed."""
+    """Rows of the product with joints, at the oracle's range, with one flag changed."""
     return {
         f"{name} {value}": Row(
-            f"product_{name}_{value}", partial(product, flags=(WITHOUT_JOINTS, f"--{field}={value}"))
+            f"product_joints_{name}_{value}", partial(product, flags=(*WITH_JOINTS, f"--{field}={value}"), wide=True)
         )
         for value in values
     }
 
 
-_many = partial(product, flags=(WITHOUT_JOINTS, "--variants=10"))  # the first n of more variants are those of n
 SWEEPS: dict[str, dict[str, Row]] = {
-    "range": _swept("range", "perturbation.azimuth_deg", (5, 10, 15, 20, 30))
-    | {"product, the oracle's range": Row("product_wide", partial(product, wide=True))},
+    "range": {
+        "product": ROWS["product"],
+        "product, the oracle's range": Row("product_wide", partial(product, wide=True)),
+        "product with joints": ROWS["product with joints"],
+        "product with joints, the oracle's range": ROWS["product with joints, the oracle's range"],
+    }
+    | _swept("range", "perturbation.azimuth_deg", (5, 20, 30)),
     "sampling": {
-        "one pose per episode": ROWS["product"],
         "oracle, one pose per frame": Row("oracle_per_frame", oracle_per_frame),
         "one pose per frame": Row(
-            "product_per_frame", partial(product, flags=(WITHOUT_JOINTS, "--perturbation.per_frame=true"))
+            "product_joints_per_frame",
+            partial(product, flags=(*WITH_JOINTS, "--perturbation.per_frame=true"), wide=True),
         ),
-        "without the recorded episodes": Row("product", product, source=False),
+        "without the recorded episodes": Row("product_joints_variants_6", _many, variants=2, source=False),
     },
-    "variants": {f"variants {n}": Row("product_variants_10", _many, variants=n) for n in (1, 2, 3, 6, 10)},
-    "max_unseen": _swept("max_unseen", "max_unseen", (0.05, 0.1, 0.2, 0.4, 1.0)),
-    "fill": _swept("fill", "fill", ("inpaint", "nearest", "none")),
-    "gate": _swept("min_expected_db", "gate.min_expected_db", (0, 12, 14, 16, 18)),
+    "variants": {f"variants {n}": Row("product_joints_variants_6", _many, variants=n) for n in (1, 2, 4, 6)},
+    "max_unseen": _swept("max_unseen", "max_unseen", (0.05, 0.1, 0.4, 1.0)),
+    "fill": _swept("fill", "fill", ("nearest", "none")),
+    "gate": _swept("min_expected_db", "gate.min_expected_db", (0, 12, 16, 18)),
 }
