@@ -2,12 +2,19 @@
 
 from dataclasses import dataclass
 
+import cv2
+import numpy as np
+import torch
 from jaxtyping import Bool, Float, Int
+from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.geometry import nearest_pixel, project, transform_points
 
+NEAR_PX = 6  # about some pixels, in which Gaussians of usual size are looked for
+REACH = 5.0  # standard deviations: 3.33 to the alpha that is shown last, half as much again for oblique views
+BLUR_PX = 2.0  # by which a rasterizer's low-pass filter enlarges that
 TOLERANCE = 0.01  # share of a surface's depth by which a point may lie behind it and still be what is seen
 
 
@@ -40,3 +47,29 @@ def projected(points: Float[Tensor, "n 3"], camera: CameraTrack) -> Projection:
     """Points (m, world) through the first pose of a camera."""
     xy, z = project(transform_points(camera.camera_from_world[0], points), camera.intrinsics[0])
     return Projection(xy, z, camera.width, camera.height)
+
+
+@dataclass(frozen=True)
+class Footprints:
+    """About where a camera sees Gaussians."""
+
+    pixel: Int[Tensor, " n"]  # of the centre, row by row; of the nearest one where the centre is outside
+    wide: Bool[Tensor, " n"]  # whether it may reach farther than `NEAR_PX`
+    ahead: Bool[Tensor, " n"]  # whether the centre is in front of the camera
+
+    def may_cover(self, where: Bool[ndarray, "h w"]) -> Bool[Tensor, " n"]:
+        """Which may cover any of some pixels: all that do, and some that do not."""
+        around = cv2.dilate(where.astype(np.uint8), np.ones((2 * NEAR_PX + 1,) * 2, np.uint8)) > 0
+        near = torch.from_numpy(around).to(self.pixel.device).flatten()[self.pixel]
+        return self.ahead & (near | self.wide)
+
+
+def footprints(means: Float[Tensor, "n 3"], sizes: Float[Tensor, " n"], camera: CameraTrack) -> Footprints:
+    """Those of Gaussians at some places (m, world) through the first pose of a camera.
+
+    `sizes` (m) are their largest standard deviations.
+    """
+    seen = projected(means, camera)
+    row, column = seen.pixel
+    reach = REACH * sizes * camera.intrinsics[0, 0, 0] + BLUR_PX * seen.z  # px, times depth
+    return Footprints(row * camera.width + column, reach > NEAR_PX * seen.z, seen.z > 0)

@@ -11,7 +11,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.core.geometry import matrix_to_quaternion, transform_points, unproject_image
+from lerobot_msdyn.core.geometry import matrix_to_quaternion, pixel_grid, transform_points, unproject_image
 from lerobot_msdyn.core.images import masked_median, nearest_of
 from lerobot_msdyn.core.sampling import evenly, scaled_px
 from lerobot_msdyn.scene.gaussians import Gaussians, gaussians_from_points
@@ -95,10 +95,16 @@ def fill_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     return torch.from_numpy(depth.numpy().ravel()[nearest_of(known)])
 
 
-def surface_frames(points: Float[Tensor, "h w 3"]) -> tuple[Float[Tensor, "h w 3 3"], Float[Tensor, "h w"]]:
-    """Rotations whose third column is the surface normal (towards the camera), and the cosine of the viewing angle."""
-    dx = torch.gradient(points, dim=1)[0]
-    dy = torch.gradient(points, dim=0)[0]
+def surface_frames(
+    points: Float[Tensor, "*n 3"], dx: Float[Tensor, "*n 3"], dy: Float[Tensor, "*n 3"]
+) -> tuple[Float[Tensor, "*n 3 3"], Float[Tensor, "*n"]]:
+    """Rotations whose third column is the surface normal (towards the camera), and the cosine of the viewing angle.
+
+    Args:
+        points: of a surface, in the camera's axes.
+        dx: how they change from pixel to pixel to the right.
+        dy: and downwards.
+    """
     normal = torch.nn.functional.normalize(torch.linalg.cross(dy, dx), dim=-1)
     view = torch.nn.functional.normalize(points, dim=-1)
     cosine = -(normal * view).sum(-1)
@@ -121,14 +127,21 @@ def pixel_gaussians(
     camera: CameraTrack,
     frame: int,
     step: int = 1,
+    where: Bool[Tensor, "h w"] | None = None,
 ) -> tuple[Gaussians, Float[Tensor, "n 2"]]:
-    """One flat Gaussian for every `step`-th pixel of an image with dense depth (m), and the pixels' centres (px)."""
+    """One flat Gaussian for every `step`-th pixel of an image with dense depth (m), and the pixels' centres (px).
+
+    `where`: of these pixels alone.
+    """
     intrinsics = camera.intrinsics[frame]
-    points = unproject_image(depth, intrinsics)
-    rotation, cosine = surface_frames(points)
+    image = unproject_image(depth, intrinsics)
     offset = step // 2
-    take = (slice(offset, None, step), slice(offset, None, step))
-    points, rotation, cosine = points[take].reshape(-1, 3), rotation[take].reshape(-1, 3, 3), cosine[take].reshape(-1)
+    every = torch.zeros(depth.shape, dtype=torch.bool)
+    every[offset::step, offset::step] = True
+    take = every if where is None else every & where
+    dy, dx = torch.gradient(image, dim=(0, 1))
+    points = image[take]
+    rotation, cosine = surface_frames(points, dx[take], dy[take])
     width = SIGMA_PX * step * points[:, 2] / intrinsics[0, 0]
     scales = torch.stack((width / cosine.clamp(min=1 / MAX_STRETCH), width, width * FLATNESS), dim=-1)
     world_from_camera = camera.world_from_camera[frame]
@@ -136,18 +149,10 @@ def pixel_gaussians(
         means=transform_points(world_from_camera, points),
         quats=matrix_to_quaternion(world_from_camera[:3, :3] @ rotation),
         scales=scales,
-        rgb=rgb[take].reshape(-1, 3).float() / 255,
+        rgb=rgb[take].float() / 255,
         opacity=OPACITY,
     )
-    xy = torch.stack(
-        torch.meshgrid(
-            torch.arange(offset, depth.shape[1], step) + 0.5,
-            torch.arange(offset, depth.shape[0], step) + 0.5,
-            indexing="xy",
-        ),
-        dim=-1,
-    )
-    return gaussians, xy.reshape(-1, 2)
+    return gaussians, pixel_grid(*depth.shape)[take]
 
 
 def background_gaussians(

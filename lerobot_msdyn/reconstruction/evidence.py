@@ -8,7 +8,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack, concatenated
-from lerobot_msdyn.core.geometry import nearest_pixel
 from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.core.visibility import TOLERANCE, projected
@@ -60,13 +59,16 @@ def in_front(
     """
     height, width = depth.shape
     seen = projected(points, camera)
-    x, y = (torch.nan_to_num(seen.xy) - 0.5).floor().unbind(-1)
-    farthest, most = torch.zeros_like(seen.z), torch.zeros_like(seen.z)
-    for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
-        around = nearest_pixel(torch.stack((x + right, y + down), dim=-1), width, height)
-        farthest = torch.maximum(farthest, depth[around])
-        most = torch.maximum(most, value[around].float())
+    column, row = (torch.nan_to_num(seen.xy) + 0.5).long().unbind(-1)
+    around = row.clamp(0, height), column.clamp(0, width)
+    farthest, most = _largest_of_four(depth)[around], _largest_of_four(value.float())[around]
     return torch.where(seen.inside & (seen.z <= farthest * (1 + TOLERANCE)), most, 0).long()
+
+
+def _largest_of_four(image: Float[Tensor, "h w"]) -> Float[Tensor, "h+1 w+1"]:
+    """The largest value of the pixels that meet at each corner of a pixel."""
+    padded = torch.nn.functional.pad(image[None, None], (1, 1, 1, 1), mode="replicate")
+    return torch.nn.functional.max_pool2d(padded, 2, stride=1)[0, 0]
 
 
 def still_frames(evidence: Evidence, points: Float[Tensor, "n 3"]) -> Int[Tensor, " n"]:

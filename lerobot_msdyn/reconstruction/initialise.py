@@ -86,12 +86,11 @@ def gather_moving(
             chosen |= _certain(instances > 0, depth, border_px) & ~body
         if frame in frames:
             chosen |= _certain(instances > 0, depth, config.mask_border_px) & body
-        inside = chosen.reshape(-1)
-        if not bool(inside.any()):
+        if not bool(chosen.any()):
             continue
-        pixels, _ = pixel_gaussians(view.rgb[frame], fill_depth(priors.depth[frame]), view.camera, frame)
-        pixels = pixels.select(inside)
-        canonical, part = to_canonical(pixels, motion, frame, priors.instances[frame].reshape(-1)[inside].long())
+        filled = fill_depth(priors.depth[frame])
+        pixels, _ = pixel_gaussians(view.rgb[frame], filled, view.camera, frame, where=chosen)
+        canonical, part = to_canonical(pixels, motion, frame, priors.instances[frame][chosen].long())
         gathered.append(canonical)
         parts.append(part)
     if not gathered:

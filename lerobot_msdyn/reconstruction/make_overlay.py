@@ -2,6 +2,7 @@
 
 import logging
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -14,12 +15,13 @@ from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.core.sampling import scaled_px
 from lerobot_msdyn.core.serialise import to_device
-from lerobot_msdyn.core.visibility import projected
+from lerobot_msdyn.core.visibility import footprints, projected
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.reconstruction.background import fill_depth, pixel_gaussians
-from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.render.cpu.threads import in_threads
+from lerobot_msdyn.scene.dynamic import DynamicScene, Snapshot, patched
 from lerobot_msdyn.scene.overlay import FramePatch, Overlay, packed
-from lerobot_msdyn.scene.rendering import Rendering, render_patched, render_scene
+from lerobot_msdyn.scene.rendering import Rendering, render_scene, render_snapshot
 
 logger = logging.getLogger(__name__)
 
@@ -47,17 +49,25 @@ def unexplained(scene: DynamicScene, view: View, priors: Priors, backend: str = 
         priors: its depth.
         backend: of the rasterizer.
     """
-    patches, still, tolerance = [], None, depth_tolerance(priors)
-    for frame in range(len(view.rgb)):
-        camera, when = view.camera.select([frame]), torch.tensor([frame])
-        depth = fill_depth(priors.depth[frame])
-        if still is None or not view.camera.is_static:
-            still = render_scene(scene.still(), camera, when, backend).depth[0].cpu()
-        rendering = to_device(render_scene(scene, camera, when, backend), "cpu")
+    tolerance = depth_tolerance(priors)
+
+    def still_depth(frame: int) -> Float[Tensor, "h w"]:
+        shown = render_scene(scene.still(), view.camera.select([frame]), torch.tensor([frame]), backend)
+        return shown.depth[0].cpu()
+
+    always = still_depth(0) if view.camera.is_static else None
+
+    def patch_of(frame: int) -> FramePatch:
+        depth, still = fill_depth(priors.depth[frame]), still_depth(frame) if always is None else always
+        camera, when = to_device((view.camera.select([frame]), torch.tensor([frame])), scene.device)
+        snapshot = scene.at(when, camera.world_from_camera[:, :3, 3])
+        rendering = to_device(render_snapshot(snapshot, camera, scene.near, backend), "cpu")
         wrong = _wrong(rendering, view.rgb[frame].float() / 255, depth.numpy(), tolerance)
         taken = wrong & ~_behind_an_edge(depth.numpy(), still.numpy())
-        patches.append(_patch(scene, view, depth, frame, wrong, taken, backend))
-    overlay = packed(patches)
+        return _patch(snapshot, view, depth, frame, wrong, taken, scene.near, backend)
+
+    frames = range(len(view.rgb))
+    overlay = packed([*(in_threads(patch_of, frames) if scene.device.type == "cpu" else map(patch_of, frames))])
     percent = 100 * len(overlay.means) / max(priors.depth.numel(), 1)
     logger.info("overlay: %.1f %% of all pixels are not explained and shown as recorded", percent)
     return overlay
@@ -106,12 +116,13 @@ def _behind_an_edge(depth: Float[ndarray, "h w"], still: Float[ndarray, "h w"]) 
 
 
 def _patch(
-    scene: DynamicScene,
+    snapshot: Snapshot,
     view: View,
     depth: Float[Tensor, "h w"],
     frame: int,
     wrong: Bool[ndarray, "h w"],
     taken: Bool[ndarray, "h w"],
+    near: float,
     backend: str,
 ) -> FramePatch:
     """The pixels that are taken as Gaussians, with colours that make the rendered picture the recorded one.
@@ -120,18 +131,20 @@ def _patch(
     beside, which are what mixes with it. More is lacking where something else is seen through, as at the picture's
     border: from another camera, that would be a bright line.
     """
-    camera, when = view.camera.select([frame]), torch.tensor([frame])
-    chosen = torch.from_numpy(taken).reshape(-1)
-    pixels = pixel_gaussians(view.rgb[frame], depth, view.camera, frame)[0].select(chosen)
-    hidden = _hidden(scene, camera, when, depth, torch.from_numpy(wrong), torch.from_numpy(taken))
-    log_scales, recorded = pixels.log_scales + math.log(SCALE), view.rgb[frame].reshape(-1, 3)[chosen].float() / 255
+    camera, picture, chosen = view.camera.select([frame]), view.rgb[frame], torch.from_numpy(taken)
+    pixels = pixel_gaussians(picture, depth, view.camera, frame, where=chosen)[0]
+    hidden = _hidden(to_device(snapshot, "cpu"), camera, depth, torch.from_numpy(wrong), chosen)
+    log_scales, recorded = pixels.log_scales + math.log(SCALE), picture[chosen].float() / 255
     first = FramePatch(pixels.means, pixels.quats, log_scales, recorded, hidden)
     if len(first) == 0:
         return first
-    rendered = render_patched(scene, camera, frame, first, backend).rgb[0].cpu().reshape(-1, 3)[chosen]
-    most = _contrast(view.rgb[frame]).reshape(-1, 3)[chosen]
+    camera = to_device(camera, snapshot.means.device)
+    beside = footprints(snapshot.means[0], snapshot.scales.amax(-1), camera).may_cover(taken)  # all that these show
+    alone = to_device(replace(first, hidden=hidden | ~beside.cpu()), snapshot.means.device)
+    rendered = render_snapshot(patched(snapshot, alone), camera, near, backend).rgb[0].cpu()[chosen]
+    most = _contrast(picture)[chosen]
     lacking = (recorded - rendered).clamp(-most, most)
-    return FramePatch(pixels.means, pixels.quats, log_scales, (recorded + lacking).clamp(0, 1.5), hidden)
+    return replace(first, rgb=(recorded + lacking).clamp(0, 1.5))
 
 
 def _contrast(rgb: UInt8[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
@@ -141,15 +154,13 @@ def _contrast(rgb: UInt8[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
 
 
 def _hidden(
-    scene: DynamicScene,
+    snapshot: Snapshot,
     camera: CameraTrack,
-    when: Tensor,
     depth: Float[Tensor, "h w"],
     wrong: Bool[Tensor, "h w"],
     taken: Bool[Tensor, "h w"],
 ) -> Bool[Tensor, " g"]:
     """Gaussians on or before the recorded surface: moving ones where it is wrong, static ones where it is replaced."""
-    snapshot = to_device(scene.at(when), "cpu")
     seen = projected(snapshot.means[0], camera)
     replaced = torch.where(snapshot.moving > 0, wrong[seen.pixel], taken[seen.pixel])
     return replaced & seen.visible(depth, THICKNESS)

@@ -8,7 +8,7 @@ of frames in which each of its Gaussians was visible. The rest is uncovered: no 
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray
 from torch import Tensor
 
@@ -26,7 +26,6 @@ class Coverage:
     """Per pixel of a new view, what is known about the surface that it shows."""
 
     unseen: Bool[ndarray, "h w"]  # uncovered: shown in no frame, or a hole
-    angle_deg: Float32[ndarray, "h w"]  # between the new line of sight and the recorded one of the same time; 180: none
     frames_seen: Int[ndarray, "h w"]  # number of frames that show it
     empty: Bool[ndarray, "h w"]  # a hole
 
@@ -36,35 +35,52 @@ class Coverage:
         return float(self.unseen.mean())
 
 
-def coverage_of(
-    rendering: Rendering, camera: CameraTrack, times: Int[Tensor, " t"], evidence: Evidence
-) -> list[Coverage]:
+def coverage_of(rendering: Rendering, camera: CameraTrack, evidence: Evidence) -> list[Coverage]:
     """Coverage of some frames, computed on the device of the rendering and the evidence.
 
     Args:
         rendering: the frames, with the frames that show each moving Gaussian as its `extra`.
         camera: through which they were rendered, one pose each.
-        times: the scene's frames that they show.
         evidence: what was recorded.
     """
     assert rendering.extra is not None
-    camera = to_device(camera, rendering.depth.device)
-    coverages = []
-    for i, time in enumerate(times.tolist()):
-        depth, alpha = rendering.depth[i], rendering.alpha[i]
-        nearest = min(time, len(evidence.camera) - 1)
-        recorded = evidence.camera.select(slice(nearest, nearest + 1))
-        in_camera = unproject_image(depth, camera.intrinsics[i]).reshape(-1, 3)
-        points = transform_points(camera.world_from_camera[i], in_camera)
-        frames_background = still_frames(evidence, points).reshape(depth.shape)
+    device = rendering.depth.device
+    holds = camera.is_static and device.type == "cpu"  # elsewhere to look for what differs costs more than it spares
+    camera = to_device(camera, device)
+    coverages, still = [], torch.zeros(0, dtype=torch.long)
+    for i, (depth, alpha) in enumerate(zip(rendering.depth, rendering.alpha, strict=True)):
+        pose = camera.select([i])
+        if holds and i > 0:  # what the frame before has shown
+            new = depth != rendering.depth[i - 1]
+            still = still.clone()
+            still[new] = still_frames(evidence, _points(depth, pose)[new.flatten()])
+        else:
+            still = still_frames(evidence, _points(depth, pose)).reshape(depth.shape)
         moving = rendering.moving[i] > 0.5 * alpha
         frames_moving = (rendering.extra[i] / rendering.moving[i].clamp(min=1e-6)).round().long()
         empty = alpha < HOLE_ALPHA
-        frames = torch.where(moving, frames_moving, frames_background).masked_fill(empty, 0)
-        sight = points - camera.world_from_camera[i, :3, 3]
-        recorded_sight = points - recorded.world_from_camera[0, :3, 3]
-        cosine = torch.nn.functional.cosine_similarity(sight, recorded_sight, dim=-1).clamp(-1, 1)
-        angle = torch.rad2deg(torch.arccos(cosine)).reshape(depth.shape).masked_fill(frames == 0, 180.0)
-        on_host = to_device((frames == 0, angle, frames, empty), "cpu")
+        frames = torch.where(moving, frames_moving, still).masked_fill(empty, 0)
+        on_host = to_device((frames == 0, frames, empty), "cpu")
         coverages.append(Coverage(*(values.numpy() for values in on_host)))
     return coverages
+
+
+def angles_of(depth: Float[Tensor, "h w"], camera: CameraTrack, recorded: CameraTrack) -> Float32[ndarray, "h w"]:
+    """Angles (degrees) between the line of sight to what a pixel shows and that of the recorded camera to the same.
+
+    All on the host.
+
+    Args:
+        depth: m, through the first pose of `camera`.
+        camera: the new one.
+        recorded: the other one, whose first pose counts.
+    """
+    points = _points(depth, camera)
+    new, old = (points - one.world_from_camera[0, :3, 3] for one in (camera, recorded))
+    cosine = torch.nn.functional.cosine_similarity(new, old, dim=-1).clamp(-1, 1)
+    return torch.rad2deg(torch.arccos(cosine)).reshape(depth.shape).numpy()
+
+
+def _points(depth: Float[Tensor, "h w"], camera: CameraTrack) -> Float[Tensor, "n 3"]:
+    """What the pixels show (m, world) through the first pose of a camera."""
+    return transform_points(camera.world_from_camera[0], unproject_image(depth, camera.intrinsics[0]).reshape(-1, 3))

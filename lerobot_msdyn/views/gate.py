@@ -18,7 +18,7 @@ from lerobot_msdyn.reconstruction.result import FittedWindow
 from lerobot_msdyn.reconstruction.self_check import flicker, sharpness, stands_still
 from lerobot_msdyn.scene.rendering import Rendering, render_scene
 from lerobot_msdyn.scene.sources import MovingPixels, moving_pixels_of_view
-from lerobot_msdyn.views.coverage import Coverage, coverage_of
+from lerobot_msdyn.views.coverage import Coverage, angles_of, coverage_of
 from lerobot_msdyn.views.expected_error import Expected, expected_error
 
 HEAT_WIDTH = 24  # columns of the map of what is uncovered
@@ -76,7 +76,7 @@ def judge(windows: Sequence[FittedWindow], camera: CameraTrack) -> Scores:
     sharp: list[tuple[float, float]] = []  # rendered and recorded, by frame
     moving = MovingPixels()
     for window in windows:
-        check = window.self_check
+        check, recorded = window.self_check, to_device(window.evidence.camera, "cpu")
         fitted = check.camera
         poses = camera.select(check.frames + window.start).resized(fitted.width, fitted.height)
         error = expected_error(check, poses)
@@ -93,7 +93,8 @@ def judge(windows: Sequence[FittedWindow], camera: CameraTrack) -> Scores:
         for i, (frame, coverage) in enumerate(zip(check.frames.tolist(), coverages, strict=True)):
             sharp.append((sharpness(pictures[i : i + 1]), sharpness(check.recorded[i : i + 1])))
             covered = ~coverage.unseen
-            angle = float(coverage.angle_deg[covered].mean()) if covered.any() else 180.0
+            angles = angles_of(rendering.depth[i], poses.select([i]), recorded.select([frame]))
+            angle = float(angles[covered].mean()) if covered.any() else 180.0
             frames.append(
                 FrameScores(
                     frame + window.start,
@@ -178,7 +179,7 @@ def _plain(value: Any) -> Any:
 def _rendered(window: FittedWindow, poses: CameraTrack) -> tuple[Rendering, list[Coverage]]:
     """The checked frames through other poses, and what is known about their pixels; on the host."""
     rendering = render_scene(window.scene, poses, window.self_check.frames, extra=window.evidence.moving_frames)
-    return to_device(rendering, "cpu"), coverage_of(rendering, poses, window.self_check.frames, window.evidence)
+    return to_device(rendering, "cpu"), coverage_of(rendering, poses, window.evidence)
 
 
 def _heat(uncovered: Float[ndarray, "h w"]) -> list[list[int]]:

@@ -1,24 +1,29 @@
 """A reconstructed camera's video from elsewhere: pictures and their coverage, frame by frame."""
 
+import functools
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.config import Fill, Recipe
 from lerobot_msdyn.core.serialise import to_device
-from lerobot_msdyn.reconstruction.result import Reconstruction
+from lerobot_msdyn.reconstruction.result import FittedWindow, Reconstruction
+from lerobot_msdyn.render.cpu.threads import in_threads
 from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.rendering import Rendering, render_frames
 from lerobot_msdyn.views.coverage import Coverage, coverage_of
 from lerobot_msdyn.views.filling import filled, missing
 
 logger = logging.getLogger(__name__)
+
+BATCH = 4  # frames that are rendered at a time, by each thread
+Rendered = tuple[Rendering, list[Coverage], Float[Tensor, "#t #h #w 3"]]  # frames, their coverage, what fills holes
 
 
 @dataclass(frozen=True)
@@ -95,24 +100,37 @@ class UnseenMasks:
 
 def _rendered(
     scene: Reconstruction, camera: CameraTrack, frames: Tensor | None, fill: Fill = "none"
-) -> Iterator[tuple[Rendering, list[Coverage], Float[Tensor, "#t #h #w 3"]]]:
+) -> Iterator[Rendered]:
     """Some frames at a time through another camera, what is known about them, and what fills their holes."""
     frames = torch.arange(len(scene.camera)) if frames is None else frames
     for window, part in scene.stretches(frames):
         times, poses = frames[part] - window.start, camera.select(part)
         once = poses.is_static and fill != "none"
         filling = _filled_background(window.scene, poses, times, fill) if once else None
-        done = 0
-        for rendering in render_frames(window.scene, poses, times, extra=window.evidence.moving_frames):
-            batch = slice(done, done + len(rendering.alpha))
-            done = batch.stop
-            if fill == "none":
-                behind = rendering.rgb.new_zeros(1, 1, 1, 3)
-            elif filling is None:
-                behind = torch.stack([_filled(rendering, i, fill) for i in range(len(rendering.alpha))])
-            else:
-                behind = filling * _brightness(window.scene, times[batch], times)
-            yield rendering, coverage_of(rendering, poses.select(batch), times[batch], window.evidence), behind
+        some = functools.partial(_some_rendered, window, poses, times, fill, filling)
+        starts = range(0, len(times), BATCH)
+        yield from in_threads(some, starts) if window.scene.device.type == "cpu" else map(some, starts)
+
+
+def _some_rendered(
+    window: FittedWindow,
+    camera: CameraTrack,
+    times: Int[Tensor, " every"],
+    fill: Fill,
+    filling: Float[Tensor, "1 h w 3"] | None,
+    start: int,
+) -> Rendered:
+    """A batch of a window's frames."""
+    batch = slice(start, min(start + BATCH, len(times)))
+    poses = camera.select(batch)
+    rendering = next(render_frames(window.scene, poses, times[batch], extra=window.evidence.moving_frames))
+    if fill == "none":
+        behind = rendering.rgb.new_zeros(1, 1, 1, 3)
+    elif filling is None:
+        behind = torch.stack([_filled(rendering, i, fill) for i in range(len(rendering.alpha))])
+    else:
+        behind = filling * _brightness(window.scene, times[batch], times)
+    return rendering, coverage_of(rendering, poses, window.evidence), behind
 
 
 def _filled(rendering: Rendering, i: int, fill: Fill) -> Float[Tensor, "h w 3"]:

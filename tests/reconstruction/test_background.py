@@ -27,6 +27,12 @@ def camera() -> CameraTrack:
     return static_camera(intrinsics_from_fov(WIDTH, HEIGHT, 60.0), 1, WIDTH, HEIGHT, orbit_offset(30.0, 10.0, 1.0))
 
 
+def with_steps(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Points of an image, and how they change to the right and downwards."""
+    dy, dx = torch.gradient(points, dim=(0, 1))
+    return points, dx, dy
+
+
 def slanted_plane(camera: CameraTrack, degrees: float) -> torch.Tensor:
     """Depth of a plane through (0, 0, 1) turned about the camera's x axis."""
     rays = unproject_image(torch.ones(HEIGHT, WIDTH), camera.intrinsics[0])
@@ -44,7 +50,7 @@ def test_every_pixel_has_its_gaussian_where_its_surface_is(camera: CameraTrack) 
 
 def test_gaussians_lie_flat_on_the_surface(camera: CameraTrack) -> None:
     depth = slanted_plane(camera, 40)
-    rotation, _ = surface_frames(unproject_image(depth, camera.intrinsics[0]))
+    rotation, _ = surface_frames(*with_steps(unproject_image(depth, camera.intrinsics[0])))
     expected = torch.tensor([0.0, -math.sin(math.radians(40)), -math.cos(math.radians(40))])
     torch.testing.assert_close(rotation[5, 5, :, 2], expected, atol=1e-4, rtol=0)
     gaussians, _ = pixel_gaussians(torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8), depth, camera, 0)
@@ -57,7 +63,7 @@ def test_gaussians_lie_flat_on_the_surface(camera: CameraTrack) -> None:
 def test_rotations_are_proper_everywhere(camera: CameraTrack) -> None:
     depth = slanted_plane(camera, 20)
     depth[10:, 16:] *= 3  # a depth edge
-    rotation, cosine = surface_frames(unproject_image(depth, camera.intrinsics[0]))
+    rotation, cosine = surface_frames(*with_steps(unproject_image(depth, camera.intrinsics[0])))
     identity = torch.eye(3).expand_as(rotation)
     torch.testing.assert_close(rotation.transpose(-1, -2) @ rotation, identity, atol=1e-5, rtol=0)
     torch.testing.assert_close(torch.linalg.det(rotation), torch.ones(HEIGHT, WIDTH))

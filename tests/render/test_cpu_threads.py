@@ -7,6 +7,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from lerobot_msdyn.render import rasterize
+from lerobot_msdyn.render.cpu.threads import in_threads, threads
 
 
 @pytest.fixture
@@ -26,8 +27,8 @@ def test_bits_do_not_depend_on_the_number_of_threads(make_scene, restore_threads
     scene = make_scene(count=3000, width=200, height=140, views=2, channels=8)
     torch.set_num_threads(1)
     expected = images_and_gradients(scene)
-    for threads in (2, 3, 7):
-        torch.set_num_threads(threads)
+    for count in (2, 3, 7):
+        torch.set_num_threads(count)
         for _ in range(3):
             got = images_and_gradients(scene)
             assert all(torch.equal(a, b) for a, b in zip(got, expected, strict=True))
@@ -44,10 +45,10 @@ def test_two_python_threads_at_once(make_scene):
             if not all(torch.equal(a, b) for a, b in zip(got, expected[index], strict=True)):
                 failures.append(index)
 
-    threads = [threading.Thread(target=work, args=(index,)) for index in range(2)]
-    for thread in threads:
+    running = [threading.Thread(target=work, args=(index,)) for index in range(2)]
+    for thread in running:
         thread.start()
-    for thread in threads:
+    for thread in running:
         thread.join(timeout=60)
         assert not thread.is_alive()
     assert failures == []
@@ -87,3 +88,38 @@ def test_data_loader_workers(method):
     for got, want in zip(loader, expected, strict=True):
         assert torch.equal(got[0], want[0])
         assert torch.equal(got[1], want[1])
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_items_in_threads_come_in_their_order_and_few_ahead(count, restore_threads):
+    torch.set_num_threads(count)
+    taken = []
+
+    def items():
+        for item in range(20):
+            taken.append(item)
+            yield item
+
+    def square(item):
+        assert threads() == 1
+        assert not torch.is_grad_enabled()
+        return item * item
+
+    with torch.no_grad():
+        results = in_threads(square, items())
+        assert [next(results) for _ in range(3)] == [0, 1, 4]
+        assert len(taken) <= 3 + count
+        assert list(results) == [item * item for item in range(3, 20)]
+    assert torch.get_num_threads() == count
+
+
+def test_a_fault_in_a_thread_comes_out_and_ends_the_rest(restore_threads):
+    torch.set_num_threads(2)
+
+    def broken(item):
+        if item == 3:
+            raise ValueError("three")
+        return item
+
+    with pytest.raises(ValueError, match="three"):
+        list(in_threads(broken, range(1000)))

@@ -27,7 +27,7 @@ from lerobot_msdyn.reconstruction.self_check import self_check
 from lerobot_msdyn.scene import rendering
 from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.views.gate import judge
-from lerobot_msdyn.views.pictures import coverages, new_pictures, on_device
+from lerobot_msdyn.views.pictures import BATCH, coverages, new_pictures, on_device
 
 pytestmark = pytest.mark.slow
 
@@ -124,8 +124,8 @@ def test_what_is_made_of_a_fit(gpu: FakeGpu) -> None:
     assert np.isfinite(scores.expected_db)
     waits.pop("scene/overlay.py _first")
     assert waits == {"scene/dynamic.py patched": FRAMES, "motion/model/bases.py _moves": 1}
-    batches = -(-FRAMES // 8)
-    assert copies == {"core/serialise.py to_device": 4 * FRAMES + 2 * batches}  # coverage; pictures and depth
+    batches = -(-FRAMES // BATCH)
+    assert copies == {"core/serialise.py to_device": 3 * FRAMES + 2 * batches}  # coverage; pictures and depth
 
 
 def test_values_keep_their_structure() -> None:

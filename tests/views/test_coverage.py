@@ -1,5 +1,7 @@
 """What of a new view is uncovered: against synthetic scenes whose every surface is known."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -12,11 +14,11 @@ from lerobot_msdyn.reconstruction.evidence import Evidence, evidence_of
 from lerobot_msdyn.reconstruction.key_views import fixed_view
 from lerobot_msdyn.reconstruction.reconstruct import reconstruct
 from lerobot_msdyn.scene.dynamic import DynamicScene
-from lerobot_msdyn.scene.rendering import render_scene
+from lerobot_msdyn.scene.rendering import Rendering, render_scene
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.nvs import covisibility
 from lerobot_msdyn.synthetic.viewpoints import heldout_cameras
-from lerobot_msdyn.views.coverage import Coverage, coverage_of
+from lerobot_msdyn.views.coverage import Coverage, angles_of, coverage_of
 from lerobot_msdyn.views.pictures import coverages, new_pictures
 
 WIDTH, HEIGHT = 64, 48
@@ -41,7 +43,7 @@ def covered(offset: torch.Tensor) -> Coverage:
     times = torch.tensor([1])
     moved = CameraTrack(camera.intrinsics[:1], offset[None], WIDTH, HEIGHT)
     rendering = render_scene(scene, moved, times, extra=evidence.moving_frames)
-    return coverage_of(rendering, moved, times, evidence)[0]
+    return coverage_of(rendering, moved, evidence)[0]
 
 
 def shifted(x: float, z: float = 0.0) -> torch.Tensor:
@@ -52,7 +54,6 @@ def test_from_the_recorded_camera_only_what_was_hidden_is_unseen() -> None:
     found = covered(shifted(0.0))
     assert found.unseen[11:19, 9:15].all()
     assert found.unseen_share == pytest.approx(80 / (WIDTH * HEIGHT), abs=0.02)
-    assert (found.angle_deg[~found.unseen] < 0.1).all()
     assert set(found.frames_seen[~found.unseen]) == {3}
     assert not found.empty.any()
 
@@ -65,15 +66,30 @@ def test_beyond_the_border_and_behind_an_edge_nothing_was_seen() -> None:
     hidden = slice(round(STEP + 0.1 * focal) + 1, int(edge) - 1)  # between where the far half ends and that
     assert left.unseen[:, hidden].mean() > 0.9
     assert not left.unseen[25:, 12:28].any(), "the far half, as it was seen"
-    assert (left.angle_deg[left.unseen] == 180).all()
     assert left.frames_seen[left.unseen].max() == 0
 
 
 def test_angle_is_that_between_the_lines_of_sight() -> None:
-    found = covered(shifted(0.1))
+    camera = wall()[2]
+    depth = torch.full((HEIGHT, WIDTH), 1.0)
+    moved = CameraTrack(camera.intrinsics[:1], shifted(0.1)[None], WIDTH, HEIGHT)
     row, column = HEIGHT // 2 + 4, 10
-    assert not found.unseen[row, column]
-    assert found.angle_deg[row, column] == pytest.approx(5.2, abs=0.8)  # degrees, of 0.1 m at 1.07 m
+    assert angles_of(depth, moved, camera)[row, column] == pytest.approx(5.2, abs=0.8)  # of 0.1 m at 1.07 m
+    assert angles_of(depth, camera, camera).max() < 0.1
+
+
+def test_what_the_frame_before_has_shown_holds() -> None:
+    scene, evidence, camera = wall()
+    poses = camera.select([0, 0, 0])
+    rendering = render_scene(scene, poses, torch.tensor([0, 1, 2]), extra=evidence.moving_frames)
+    nearer = rendering.depth.clone()
+    nearer[1, 10:20, 8:16] *= 0.9  # something else is there for a frame
+    together = coverage_of(replace(rendering, depth=nearer), poses, evidence)
+    for i, found in enumerate(together):
+        alone = Rendering(*(getattr(rendering, name)[[i]] for name in ("rgb", "depth", "alpha", "moving", "extra")))
+        expected = coverage_of(replace(alone, depth=nearer[[i]]), poses.select([i]), evidence)[0]
+        assert (found.frames_seen == expected.frames_seen).all()
+    assert together[1].unseen.sum() != together[0].unseen.sum()
 
 
 @pytest.mark.parametrize("kind", ["push", "sheet"])

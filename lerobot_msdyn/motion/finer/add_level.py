@@ -21,6 +21,7 @@ from lerobot_msdyn.motion.model.bases import MotionLevel, with_idle
 from lerobot_msdyn.motion.model.compose import compose_points
 from lerobot_msdyn.motion.model.scene_motion import SceneMotion, bind
 from lerobot_msdyn.motion.spec import FinerLevel, finer_level, frames_per_knot
+from lerobot_msdyn.render.cpu.threads import in_threads
 
 _SMOOTHINGS = (1.0, 10.0, 100.0, 1000.0)  # of the bases over time, from which held-out tracks choose
 _FOLDS = 3  # each third of the tracks judges a level that was fitted to the others
@@ -68,7 +69,7 @@ def add_level(
     def level(motions: Float[Tensor, "k t 4 4"], smoothing: Float[Tensor, " k"]) -> MotionLevel:
         return smoothed_level(places, motions, canonical=canonical, smoothing=smoothing, frames_per_knot=every)
 
-    trials = [solved(fold != k) for k in range(_FOLDS)]
+    trials = [*in_threads(lambda k: solved(fold != k), range(_FOLDS))]
     gains = torch.zeros(len(_SMOOTHINGS), len(fold))
     for k, trial in enumerate(trials):
         for row, strength in enumerate(_SMOOTHINGS):
@@ -79,9 +80,12 @@ def add_level(
     fitted = level(solved(torch.ones_like(fold, dtype=torch.bool)), smoothing)
     if config.gate:
         error, gain = torch.zeros(2, len(fold))
-        for k, trial in enumerate(trials):
-            judged = _prediction(level(trial, smoothing), name, fold == k, tracks, seen, so_far)
-            error[fold == k], gain[fold == k] = judged
+
+        def judged(k: int) -> tuple[Float[Tensor, " m"], Float[Tensor, " m"]]:
+            return _prediction(level(trials[k], smoothing), name, fold == k, tracks, seen, so_far)
+
+        for k, values in enumerate(in_threads(judged, range(_FOLDS))):
+            error[fold == k], gain[fold == k] = values
         kept = torch.zeros(len(fitted), dtype=torch.bool)
         proven = _proven(error, gain, tracks.part, _VISIBLE_PX * seen.pixel_m)
         if approve is not None and bool(proven.any()):

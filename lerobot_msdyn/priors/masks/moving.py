@@ -11,10 +11,6 @@ of a cloth); something that comes to rest where no track can follow it there sta
 thing of the colour and texture of its ground is missed.
 """
 
-import os
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
-
 import cv2
 import numpy as np
 import torch
@@ -33,6 +29,7 @@ from lerobot_msdyn.priors.masks.linking import numbered
 from lerobot_msdyn.priors.masks.stabilise import camera_sway, to_frames, to_reference
 from lerobot_msdyn.priors.masks.votes import AUDIBLE, votes
 from lerobot_msdyn.priors.masks.wandering import odds_before, residual_odds
+from lerobot_msdyn.render.cpu.threads import in_threads
 
 _MAX_WIDTH = 320  # px
 _MEDIAN_SAMPLES = 60  # frames over which medians are taken
@@ -200,7 +197,7 @@ def _mended(
     def moving_at(frame: tuple[ndarray, ndarray]) -> Bool[ndarray, "h w"]:
         return _tidy(_odds(*frame, known, reference.change(frame[0]), colours) > 0)
 
-    return np.stack(_on_all_cores(moving_at, zip(frames, voted, strict=True)))
+    return np.stack([*in_threads(moving_at, zip(frames, voted, strict=True))])
 
 
 def _odds(
@@ -224,7 +221,7 @@ def _judged(
 ) -> tuple[Float32[ndarray, "s h w"], Colours]:
     """Log-odds that each pixel belongs to something that moves, and the colours that were learnt on the way."""
     reference, colours = Reference(empty, noise), Colours()
-    differences = _on_all_cores(reference.change, frames)
+    differences = [*in_threads(reference.change, frames)]
     for frame, difference in zip(frames, differences, strict=True):
         colours.add(frame, np.where(known & region, difference, 0), _SURE)
 
@@ -232,16 +229,7 @@ def _judged(
         picture, vote, difference = frame
         return _odds(picture, vote, known, difference, colours)
 
-    return np.stack(_on_all_cores(odds_at, zip(frames, voted, differences, strict=True))), colours
-
-
-def _on_all_cores[A, B](function: Callable[[A], B], frames: Iterable[A]) -> list[B]:
-    """What a function without side effects makes of each frame, in their order.
-
-    By threads: OpenCV and NumPy let others run while they compute.
-    """
-    with ThreadPoolExecutor(os.cpu_count() or 1, "frames") as pool:
-        return list(pool.map(function, frames))
+    return np.stack([*in_threads(odds_at, zip(frames, voted, differences, strict=True))]), colours
 
 
 def _ever_changing(changed: Bool[ndarray, "t h w"]) -> Bool[ndarray, "h w"]:

@@ -9,8 +9,9 @@ workers), or that which it had before `torch_on_one_thread`.
 
 import contextlib
 import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import ContextVar
 from functools import cache
 from typing import Any
@@ -64,6 +65,42 @@ def run(kernel: Callable[..., None], items: int, *arguments: Any) -> None:
     for future in futures:
         if not future.cancel():  # one that never started has nothing left to do
             future.result()
+
+
+def in_threads[A, B](function: Callable[[A], B], items: Iterable[A]) -> Iterator[B]:
+    """What a function makes of each item, in their order, on as many threads as this process may use.
+
+    Torch, NumPy, OpenCV and the kernels let others run while they compute; within the function each has one thread.
+    Few items are taken ahead of what is asked for, so that memory stays bounded.
+    """
+    count = threads()
+    if count == 1:
+        yield from map(function, items)
+        return
+    gradients = torch.is_grad_enabled()
+
+    def call(item: A) -> B:
+        with torch.set_grad_enabled(gradients):
+            return function(item)
+
+    waiting: deque[Future[B]] = deque()
+    with ThreadPoolExecutor(count, "items", initializer=_on_one_thread) as pool:
+        try:
+            for item in items:
+                waiting.append(pool.submit(call, item))
+                if len(waiting) > count:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()
+
+
+def _on_one_thread() -> None:
+    """Torch and kernels on the calling thread alone, for as long as that lives."""
+    torch.set_num_threads(1)
+    _threads.set(1)
 
 
 def point_tickets(times: int, points: int) -> int:
