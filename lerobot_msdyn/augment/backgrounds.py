@@ -1,6 +1,7 @@
 """What several episodes of a dataset show together of each camera's background, before any of them is worked on."""
 
 import contextlib
+import functools
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.reconstruction.pooled_background import MAX_EPISODES, SharedBackground, few
 from lerobot_msdyn.reconstruction.share_background import moving_in_few, share_backgrounds
 from lerobot_msdyn.reconstruction.windows import stands_of, whole_stands
-from lerobot_msdyn.render.cpu.threads import torch_on_one_thread
+from lerobot_msdyn.render.cpu.threads import in_threads, torch_on_one_thread
 
 logger = logging.getLogger(__name__)
 
@@ -77,9 +78,8 @@ def shared_backgrounds(
         ) -> Iterable[Tensor]:
             stands = [indices[number] for number in numbers]
             tasks = [MaskTask(episode, key, recipe, stand, frames.numpy()) for episode, stand in stands]
-            masks = (
-                (moving_in_episode(source, task) for task in tasks) if run is None else run(moving_in_episode, tasks)
-            )
+            look = functools.partial(moving_in_episode, source)
+            masks = in_threads(look, tasks) if run is None else run(moving_in_episode, tasks)
             for task, mask in zip(tasks, masks, strict=True):
                 yield torch.from_numpy(mask)
                 say(

@@ -28,7 +28,7 @@ from lerobot_msdyn.views.pictures import new_pictures, on_device
 logger = logging.getLogger(__name__)
 
 PROBE_FRAMES = 24
-PROBE_STEPS = 14
+PROBE_STEPS = 13  # after those that warm up, two rounds of looks at the whole picture and near what moves
 REPORT_BYTES = 3e5  # of the report, for each view with pictures
 MASKS_SHARE = 0.3  # of the time of priors and initial scene
 GROWING = ("overlay.", "shading.field", "shading.moving")  # tensors of a scene with a part for every frame
@@ -109,7 +109,7 @@ def measure_speeds(source: LeRobotDatasetMetadata, index: int, cameras: list[str
         steps = [
             after - before for before, after in zip(ticks[WARM_UP_STEPS:], ticks[WARM_UP_STEPS + 1 :], strict=False)
         ]
-        step_s += statistics.median(steps)
+        step_s += statistics.fmean(steps)
         once, each = _saved_sizes(scene.windows[0].scene)
         scene_bytes, frame_bytes = scene_bytes + once, frame_bytes + each
         with tempfile.TemporaryDirectory() as folder, time_spent_compiling() as compiling_s:

@@ -12,9 +12,10 @@ from torch import Tensor
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.geometry import nearest_pixel, project, transform_points
 
-NEAR_PX = 6  # about some pixels, in which Gaussians of usual size are looked for
-REACH = 5.0  # standard deviations: 3.33 to the alpha that is shown last, half as much again for oblique views
-BLUR_PX = 2.0  # by which a rasterizer's low-pass filter enlarges that
+SIGMAS = 3.33  # standard deviations to where a Gaussian is no longer shown (alpha of 1/255)
+STRETCH = 1.5  # by which one beside the optical axis may be larger than on it
+BLUR_PX2 = 0.3  # variance of a rasterizer's low-pass filter
+SLACK_PX = 1.0  # by which distances between pixels may be off
 TOLERANCE = 0.01  # share of a surface's depth by which a point may lie behind it and still be what is seen
 
 
@@ -54,14 +55,12 @@ class Footprints:
     """About where a camera sees Gaussians."""
 
     pixel: Int[Tensor, " n"]  # of the centre, row by row; of the nearest one where the centre is outside
-    wide: Bool[Tensor, " n"]  # whether it may reach farther than `NEAR_PX`
-    ahead: Bool[Tensor, " n"]  # whether the centre is in front of the camera
+    reach: Float[Tensor, " n"]  # px, from there, within which all that it may cover lies; below 0: it is not seen
 
     def may_cover(self, where: Bool[ndarray, "h w"]) -> Bool[Tensor, " n"]:
         """Which may cover any of some pixels: all that do, and some that do not."""
-        around = cv2.dilate(where.astype(np.uint8), np.ones((2 * NEAR_PX + 1,) * 2, np.uint8)) > 0
-        near = torch.from_numpy(around).to(self.pixel.device).flatten()[self.pixel]
-        return self.ahead & (near | self.wide)
+        distance = cv2.distanceTransform((~where).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3)
+        return torch.from_numpy(distance).to(self.pixel.device).flatten()[self.pixel] <= self.reach
 
 
 def footprints(means: Float[Tensor, "n 3"], sizes: Float[Tensor, " n"], camera: CameraTrack) -> Footprints:
@@ -71,5 +70,6 @@ def footprints(means: Float[Tensor, "n 3"], sizes: Float[Tensor, " n"], camera: 
     """
     seen = projected(means, camera)
     row, column = seen.pixel
-    reach = REACH * sizes * camera.intrinsics[0, 0, 0] + BLUR_PX * seen.z  # px, times depth
-    return Footprints(row * camera.width + column, reach > NEAR_PX * seen.z, seen.z > 0)
+    deviation_px = STRETCH * sizes * camera.intrinsics[0, 0, 0] / seen.z.clamp(min=1e-6)
+    reach = SLACK_PX + SIGMAS * (deviation_px.square() + BLUR_PX2).sqrt()
+    return Footprints(row * camera.width + column, reach.masked_fill(seen.z <= 0, -1.0))

@@ -20,6 +20,7 @@ from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.reconstruction.brightness import moving_gain, static_shading
 from lerobot_msdyn.reconstruction.density import Density
 from lerobot_msdyn.reconstruction.doubt import doubts
+from lerobot_msdyn.reconstruction.focus import Focus
 from lerobot_msdyn.reconstruction.loss_terms import FitStep, Targets, certain_pixels
 from lerobot_msdyn.reconstruction.parameters import Parameters
 from lerobot_msdyn.scene.dynamic import DynamicScene
@@ -89,6 +90,8 @@ def fit(
     doubt = doubts(to_device(scene, "cpu"), view.camera, priors, config.learn.sure_px) if config.learn.bases else ()
     parameters = Parameters(scene, config, distance, doubt, learned)
     density = Density(config.density, parameters, config.steps, distance, seed)
+    wanted = Focus.wanted(config, view) and not learned
+    focus = Focus(to_device(scene, "cpu"), view, priors, scene.device) if wanted else None
     moves = priors.instances > 0
     certain = certain_pixels(moves, scaled_window(MASK_BAND_PX, view.camera.width))
     targets = to_device(Targets(view, priors, moves, certain, distance), scene.device)
@@ -104,11 +107,16 @@ def fit(
         if step == int(config.moving_gain_from * config.steps) and len(scene.moving) > 0:
             parameters.shade(_measured_shading(scene, view, priors, backend))
             scene = parameters.scene
-        frames = next(order).to(scene.device)
+        drawn = next(order)
+        frames = drawn.to(scene.device)
         camera = targets.view.camera.select(frames)
+        where = None
+        if focus is not None and step % config.whole_every > 0 and len(scene.moving) > 0:
+            scene, where = focus(scene, int(drawn))
         snapshot = scene.at(frames, camera.world_from_camera[:, :3, 3])
         density.watch(snapshot)
-        now = FitStep(scene, frames, render_snapshot(snapshot, camera, scene.near, backend), targets, random, backend)
+        rendering = render_snapshot(snapshot, camera, scene.near, backend)
+        now = FitStep(scene, frames, rendering, targets, random, backend, where)
         values = {name: term(now) for name, (term, _) in terms.items()}
         loss: Float[Tensor, ""] | None = None
         if values:

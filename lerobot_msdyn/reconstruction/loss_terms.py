@@ -36,6 +36,7 @@ class FitStep:
     targets: Targets
     random: torch.Generator  # for terms that draw; on the host
     backend: str = "auto"  # of the rasterizer, for terms that render
+    where: Bool[Tensor, "b h w"] | None = None  # pixels that are rendered whole, and compared; none: all
 
 
 LossTerm = Callable[[FitStep], Float[Tensor, ""]]  # unweighted; the weight is the recipe's

@@ -27,6 +27,7 @@ logger = logging.getLogger(__name__)
 
 COLOUR_ERROR = 0.06  # mean absolute difference of colours 0..1, over about a pixel, beyond which one is not explained
 DEPTH_ERROR = 0.02  # relative difference of depths beyond which it is not, at least
+NEVER = 1e6  # a relative difference of depths that there is not
 JUMP = 0.05  # relative step of depth to the surface in front, beyond which a pixel belongs to the one behind
 THICKNESS = 0.03  # share of the depth within which a Gaussian belongs to the recorded surface
 SCALE = 0.7  # of a pixel's Gaussian: its neighbours are rendered as well
@@ -74,9 +75,9 @@ def unexplained(scene: DynamicScene, view: View, priors: Priors, backend: str = 
 
 
 def depth_tolerance(priors: Priors) -> float:
-    """Relative difference of depths beyond which a picture is wrong; infinite for depth that is only assumed."""
+    """Relative difference of depths beyond which a picture is wrong; beyond all for depth that is only assumed."""
     traits = priors.depth_traits
-    return math.inf if traits.assumed else max(DEPTH_ERROR, traits.relative_error)
+    return NEVER if traits.assumed else max(DEPTH_ERROR, traits.relative_error)
 
 
 def _wrong(
@@ -91,10 +92,8 @@ def _wrong(
     wrong = (_blurred(difference, smooth_px) > COLOUR_ERROR) | (np.abs(rendered / depth - 1) > tolerance)
     wrong |= moving & around
     # Behind an edge colours are mixed, and say nothing; there only the depth of no pixel beside counts as wrong.
-    apart = (depth < (1 - tolerance) * cv2.erode(rendered, _BESIDE)) | (
-        depth > (1 + tolerance) * cv2.dilate(rendered, _BESIDE)
-    )
-    wrong = np.where(_behind(depth), apart, wrong)
+    nearest, farthest = (1 - tolerance) * cv2.erode(rendered, _BESIDE), (1 + tolerance) * cv2.dilate(rendered, _BESIDE)
+    wrong = np.where(_behind(depth), (depth < nearest) | (depth > farthest), wrong)
     opened = cv2.morphologyEx(wrong.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
     return cv2.dilate(opened, _BESIDE) > 0
 

@@ -11,7 +11,9 @@ from lerobot_msdyn.reconstruction.loss_terms import FitStep
 @LOSSES.register("depth")
 def depth(step: FitStep) -> Float[Tensor, ""]:
     """Between the rendered depth and the prior's."""
-    return depth_loss(step.rendering.depth, step.targets.priors.depth[step.frames], step.rendering.alpha)
+    prior = step.targets.priors.depth[step.frames]
+    known = prior if step.where is None else prior * step.where
+    return depth_loss(step.rendering.depth, known, step.rendering.alpha)
 
 
 def depth_loss(

@@ -11,7 +11,8 @@ from lerobot_msdyn.reconstruction.loss_terms import FitStep
 def mask(step: FitStep) -> Float[Tensor, ""]:
     """Between the opacity of the moving set and the masks."""
     targets, frames = step.targets, step.frames
-    return mask_loss(step.rendering.moving, targets.moves[frames], targets.certain[frames])
+    certain = targets.certain[frames] if step.where is None else targets.certain[frames] & step.where
+    return mask_loss(step.rendering.moving, targets.moves[frames], certain)
 
 
 def mask_loss(

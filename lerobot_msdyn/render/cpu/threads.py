@@ -77,14 +77,15 @@ def in_threads[A, B](function: Callable[[A], B], items: Iterable[A]) -> Iterator
     if count == 1:
         yield from map(function, items)
         return
-    gradients = torch.is_grad_enabled()
+    gradients, before = torch.is_grad_enabled(), torch.get_num_threads()
+    torch.set_num_threads(1)  # what a thread that begins has from then on
 
     def call(item: A) -> B:
         with torch.set_grad_enabled(gradients):
             return function(item)
 
     waiting: deque[Future[B]] = deque()
-    with ThreadPoolExecutor(count, "items", initializer=_on_one_thread) as pool:
+    with ThreadPoolExecutor(count, "items", initializer=_threads.set, initargs=(1,)) as pool:
         try:
             for item in items:
                 waiting.append(pool.submit(call, item))
@@ -95,12 +96,7 @@ def in_threads[A, B](function: Callable[[A], B], items: Iterable[A]) -> Iterator
         finally:
             for future in waiting:
                 future.cancel()
-
-
-def _on_one_thread() -> None:
-    """Torch and kernels on the calling thread alone, for as long as that lives."""
-    torch.set_num_threads(1)
-    _threads.set(1)
+            torch.set_num_threads(before)
 
 
 def point_tickets(times: int, points: int) -> int:

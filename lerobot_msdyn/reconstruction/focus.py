@@ -1,0 +1,65 @@
+"""Most steps of a fit look only where something moves: there the moving set is compared, what stands still stays.
+
+What stands still is the same at every frame, so that the steps between, which look at whole pictures, suffice for it.
+"""
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from lerobot_msdyn.core.config import FitConfig
+from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.core.sampling import scaled_window
+from lerobot_msdyn.core.visibility import footprints, projected
+from lerobot_msdyn.priors import Priors
+from lerobot_msdyn.scene.dynamic import DynamicScene
+
+AROUND_PX = 8  # of 320: about what moves, by mask or by motion, that is looked at as well
+BY_PIXEL = {"rgb", "depth", "mask"}  # loss terms that leave out pixels that are not looked at
+
+
+class Focus:
+    """Where the steps look that do not look at whole pictures, before a fixed camera."""
+
+    @torch.no_grad()
+    def __init__(self, scene: DynamicScene, view: View, priors: Priors, device: torch.device) -> None:
+        """For a scene as it is before the fit; the motion stays as it is.
+
+        Args:
+            scene: on the host, as are the others.
+            view: the video.
+            priors: what moves in it.
+            device: of the scenes that it will be asked about.
+        """
+        camera = view.camera.select([0])
+        # As they are at first: they hardly move.
+        self._still = footprints(scene.static.means, scene.static.scales.amax(-1), camera)
+        window = scaled_window(AROUND_PX, view.camera.width)
+        regions = []
+        for frame, instances in enumerate(priors.instances):
+            moving = (instances > 0).numpy().astype(np.uint8)
+            moved = projected(scene.positions(torch.tensor([frame]))[0, len(scene.static) :], camera)
+            row, column = (index[moved.inside].numpy() for index in moved.pixel)
+            moving[row, column] = 1
+            regions.append(torch.from_numpy(cv2.dilate(moving, window) > 0))
+        self._regions = torch.stack(regions).to(device)
+
+    @classmethod
+    def wanted(cls, config: FitConfig, view: View) -> bool:
+        """Whether a fit can do with it: what stands still keeps its place, motion is given, losses are by pixel."""
+        learns = config.learn.bases or config.learn.weights or config.density.enabled
+        terms = {name for name, weight in config.weights.items() if weight > 0}
+        return config.whole_every > 1 and view.camera.is_static and not learns and terms <= BY_PIXEL
+
+    @torch.no_grad()
+    def __call__(self, scene: DynamicScene, frame: int) -> tuple[DynamicScene, Bool[Tensor, "1 h w"]]:
+        """What is rendered at a frame, its static set without gradients, and the pixels that it shows whole.
+
+        On a GPU all of the scene is rendered, without waiting for what can be left out.
+        """
+        region = self._regions[frame]
+        on_host = region.device.type == "cpu"
+        rows = self._still.may_cover(region.numpy()).nonzero()[:, 0] if on_host else slice(None)
+        return scene.select_static(rows), region[None]

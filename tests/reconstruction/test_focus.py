@@ -1,0 +1,73 @@
+"""Where steps look only near what moves, they see there what a look at the whole picture sees."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from moving_cards import FRAMES, in_single, moving_cards, recorded_in_single
+
+from lerobot_msdyn.core.config import DensityConfig, FitConfig, LearnConfig
+from lerobot_msdyn.reconstruction import focus as focus_module
+from lerobot_msdyn.reconstruction.fit import fit
+from lerobot_msdyn.reconstruction.focus import Focus
+from lerobot_msdyn.scene.rendering import render_scene
+
+
+@pytest.mark.parametrize("frame", range(FRAMES))
+def test_the_pixels_that_are_compared_are_those_of_the_whole_picture(
+    frame: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(focus_module, "AROUND_PX", 27)  # two pixels of these pictures
+    scene = in_single(moving_cards())
+    scene = replace(scene, static=replace(scene.static, log_scales=scene.static.log_scales - 1.5))  # small ones
+    view, priors = recorded_in_single(moving_cards())
+    corner = torch.zeros_like(priors.instances)
+    corner[:, :4, :4] = 1
+    focus = Focus(scene, view, replace(priors, instances=corner), scene.device)
+    part, where = focus(scene, frame)
+    assert bool(where[0, :4, :4].all()), "what the masks say moves"
+    camera, when = view.camera.select([frame]), torch.tensor([frame])
+    whole = render_scene(scene, camera, when)
+    assert bool(where[whole.moving > 0.5].all()), "what moves by its motion"
+    assert 0 < len(part.static) < len(scene.static)
+    assert not where.all()
+    seen = render_scene(part, camera, when)
+    torch.testing.assert_close(seen.rgb[where], whole.rgb[where], atol=1e-5, rtol=0)
+    torch.testing.assert_close(seen.depth[where], whole.depth[where], atol=1e-4, rtol=0)
+
+
+def test_what_stands_still_is_left_alone_and_what_moves_is_not() -> None:
+    scene = in_single(moving_cards())
+    view, priors = recorded_in_single(moving_cards())
+    part, _ = Focus(scene, view, priors, scene.device)(replace(scene, static=_with_gradients(scene.static)), 1)
+    assert not part.static.means.requires_grad
+    one = FitConfig(steps=1, whole_every=10**6, held_out_frames=0, shadows=False, moving_gain_from=1.0)
+
+    def fitted(settings: FitConfig):
+        return fit(scene, view, priors, settings, empty=view.rgb[0], distance=1.0, seed=0).scene
+
+    often, once = fitted(replace(one, steps=4)), fitted(one)
+    assert (often.static.sh - once.static.sh).abs().max() == 0, "only the first step is a look at the whole"
+    assert (often.moving.sh - once.moving.sh).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        FitConfig(whole_every=1),
+        FitConfig(learn=LearnConfig(bases=True)),
+        FitConfig(density=DensityConfig(enabled=True)),
+        FitConfig(weights={"rgb": 1.0, "ssim": 0.2}),
+    ],
+)
+def test_fits_that_need_whole_pictures_look_at_them(settings: FitConfig) -> None:
+    view, _ = recorded_in_single(moving_cards())
+    assert Focus.wanted(FitConfig(), view)
+    assert not Focus.wanted(settings, view)
+    swaying = view.camera.world_from_camera.clone()
+    swaying[1, 0, 3] = 0.01
+    assert not Focus.wanted(FitConfig(), replace(view, camera=replace(view.camera, world_from_camera=swaying)))
+
+
+def _with_gradients(gaussians):
+    return replace(gaussians, means=gaussians.means.clone().requires_grad_())
