@@ -296,7 +296,8 @@ class FitConfig:
 
     # Largest number of Adam steps; each draws one frame.
     steps: int = between(500, 0, 1_000_000)
-    # Before a fixed camera every so many-th step looks at a whole picture, the others only near what moves; 1: all.
+    # Before a fixed camera without measured depth every so many-th step looks at a whole picture, the others only near
+    # what moves; 1: all.
     whole_every: int = between(4, 1, 1_000_000)
     # Widest image that is fitted, in pixels; wider videos are fitted at a reduced size and rendered at their own.
     max_width: int = between(320, 16, 8192)

@@ -13,7 +13,7 @@ from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.geometry import nearest_pixel, project, transform_points
 
 SIGMAS = 3.33  # standard deviations to where a Gaussian is no longer shown (alpha of 1/255)
-STRETCH = 1.5  # by which one beside the optical axis may be larger than on it
+MOST_STRETCH = 3.0  # by which one beside the optical axis, where perspective is still linear, is longer than on it
 BLUR_PX2 = 0.3  # variance of a rasterizer's low-pass filter
 SLACK_PX = 1.0  # by which distances between pixels may be off
 TOLERANCE = 0.01  # share of a surface's depth by which a point may lie behind it and still be what is seen
@@ -70,6 +70,8 @@ def footprints(means: Float[Tensor, "n 3"], sizes: Float[Tensor, " n"], camera: 
     """
     seen = projected(means, camera)
     row, column = seen.pixel
-    deviation_px = STRETCH * sizes * camera.intrinsics[0, 0, 0] / seen.z.clamp(min=1e-6)
+    focal, centre = camera.intrinsics[0, 0, 0], camera.intrinsics[0, :2, 2]
+    stretch = (1 + ((seen.xy - centre) / focal).square().sum(-1)).sqrt().clamp(max=MOST_STRETCH)
+    deviation_px = stretch * sizes * focal / seen.z.clamp(min=1e-6)
     reach = SLACK_PX + SIGMAS * (deviation_px.square() + BLUR_PX2).sqrt()
     return Footprints(row * camera.width + column, reach.masked_fill(seen.z <= 0, -1.0))

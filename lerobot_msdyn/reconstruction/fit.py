@@ -90,7 +90,7 @@ def fit(
     doubt = doubts(to_device(scene, "cpu"), view.camera, priors, config.learn.sure_px) if config.learn.bases else ()
     parameters = Parameters(scene, config, distance, doubt, learned)
     density = Density(config.density, parameters, config.steps, distance, seed)
-    wanted = Focus.wanted(config, view) and not learned
+    wanted = Focus.wanted(config, view, priors) and not learned
     focus = Focus(to_device(scene, "cpu"), view, priors, scene.device) if wanted else None
     moves = priors.instances > 0
     certain = certain_pixels(moves, scaled_window(MASK_BAND_PX, view.camera.width))

@@ -7,10 +7,13 @@ import torch
 from moving_cards import FRAMES, in_single, moving_cards, recorded_in_single
 
 from lerobot_msdyn.core.config import DensityConfig, FitConfig, LearnConfig
+from lerobot_msdyn.core.observations import DepthTraits
 from lerobot_msdyn.reconstruction import focus as focus_module
 from lerobot_msdyn.reconstruction.fit import fit
 from lerobot_msdyn.reconstruction.focus import Focus
 from lerobot_msdyn.scene.rendering import render_scene
+
+ROUGH = DepthTraits(assumed=True)
 
 
 @pytest.mark.parametrize("frame", range(FRAMES))
@@ -44,7 +47,9 @@ def test_what_stands_still_is_left_alone_and_what_moves_is_not() -> None:
     one = FitConfig(steps=1, whole_every=10**6, held_out_frames=0, shadows=False, moving_gain_from=1.0)
 
     def fitted(settings: FitConfig):
-        return fit(scene, view, priors, settings, empty=view.rgb[0], distance=1.0, seed=0).scene
+        return fit(
+            scene, view, replace(priors, depth_traits=ROUGH), settings, empty=view.rgb[0], distance=1.0, seed=0
+        ).scene
 
     often, once = fitted(replace(one, steps=4)), fitted(one)
     assert (often.static.sh - once.static.sh).abs().max() == 0, "only the first step is a look at the whole"
@@ -61,12 +66,15 @@ def test_what_stands_still_is_left_alone_and_what_moves_is_not() -> None:
     ],
 )
 def test_fits_that_need_whole_pictures_look_at_them(settings: FitConfig) -> None:
-    view, _ = recorded_in_single(moving_cards())
-    assert Focus.wanted(FitConfig(), view)
-    assert not Focus.wanted(settings, view)
+    view, recorded = recorded_in_single(moving_cards())
+    priors = replace(recorded, depth_traits=ROUGH)
+    assert Focus.wanted(FitConfig(), view, priors)
+    assert not Focus.wanted(FitConfig(), view, replace(recorded, depth_traits=DepthTraits(sharp=True)))
+    assert not Focus.wanted(settings, view, priors)
     swaying = view.camera.world_from_camera.clone()
     swaying[1, 0, 3] = 0.01
-    assert not Focus.wanted(FitConfig(), replace(view, camera=replace(view.camera, world_from_camera=swaying)))
+    moved = replace(view, camera=replace(view.camera, world_from_camera=swaying))
+    assert not Focus.wanted(FitConfig(), moved, priors)
 
 
 def _with_gradients(gaussians):
