@@ -6,6 +6,7 @@ the four recorded samples around it, weighted by distance and by how alike the l
 
 import math
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float32, UInt8
@@ -13,6 +14,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.core.compiled import compiled
+from lerobot_msdyn.render.cpu.threads import in_threads
 
 RED, GREEN, BLUE = 0.299, 0.587, 0.114  # luma of ITU-R BT.601, as decoders use it at these sizes
 LUMA_SIGMA = 20.0  # difference of luma (0..255) at which a sample counts exp(-1/2)
@@ -30,11 +32,17 @@ def is_subsampled(pix_fmt: str) -> bool:
 
 def restore_chroma(frames: UInt8[Tensor, "t h w 3"]) -> UInt8[Tensor, "t h w 3"]:
     """The same frames with chroma at full size; luma stays as it is, up to rounding and to the range of colours."""
-    out = np.empty(frames.shape, np.uint8)
-    for frame, restored in zip(frames.contiguous().numpy(), out, strict=True):
+
+    def restored(frame: UInt8[ndarray, "h w 3"]) -> UInt8[ndarray, "h w 3"]:
+        out = np.empty_like(frame)
         luma = frame.astype(np.float32) @ np.array([RED, GREEN, BLUE], np.float32)
-        _restore(luma, *_samples(frame, luma), _ALIKE, restored)
-    return torch.from_numpy(out)
+        _restore(luma, *_samples(frame, luma), _ALIKE, out)
+        return out
+
+    whole = np.empty(frames.shape, np.uint8)
+    for place, frame in zip(whole, in_threads(restored, frames.contiguous().numpy()), strict=True):
+        place[:] = frame
+    return torch.from_numpy(whole)
 
 
 def _samples(
@@ -44,7 +52,8 @@ def _samples(
     height, width = luma.shape
     values = np.dstack((luma, frame[..., 0] - luma, frame[..., 2] - luma))
     padded = np.pad(values, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-    blocks = padded.reshape(padded.shape[0] // 2, 2, padded.shape[1] // 2, 2, 3).mean((1, 3), dtype=np.float32)
+    size = padded.shape[1] // 2, padded.shape[0] // 2
+    blocks = cv2.resize(padded, size, interpolation=cv2.INTER_AREA)  # at half the size: means of blocks
     return np.ascontiguousarray(blocks[..., 0]), np.ascontiguousarray(blocks[..., 1:])
 
 

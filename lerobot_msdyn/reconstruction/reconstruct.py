@@ -36,7 +36,7 @@ from lerobot_msdyn.reconstruction.share_background import moving_in_few, share_b
 from lerobot_msdyn.reconstruction.steady import steadied
 from lerobot_msdyn.reconstruction.upright import up_of
 from lerobot_msdyn.reconstruction.windows import Window, stands_of, whole_stands, windows
-from lerobot_msdyn.render.cpu.threads import torch_on_one_thread
+from lerobot_msdyn.render.cpu.threads import in_threads, torch_on_one_thread
 from lerobot_msdyn.render.devices import chosen_device
 from lerobot_msdyn.scene.dynamic import DynamicScene
 
@@ -284,7 +284,7 @@ def _shared_by_windows(
     """What the windows of one video show together."""
 
     def moving(numbers: Sequence[int], frames: Tensor) -> list[Tensor]:
-        return [moving_in_few(parts[number], recipe, frames, episode, key) for number in numbers]
+        return [*in_threads(lambda number: moving_in_few(parts[number], recipe, frames, episode, key), numbers)]
 
     with torch_on_one_thread():
         return share_backgrounds([part.few_frames(recipe.fit.max_width) for part in parts], moving, recipe)

@@ -100,9 +100,9 @@ def _write_preview(
     ranked = sorted(places, key=lambda i: entries[i].score)
     if ranked:
         middle = ranked[len(ranked) // 2]
-        before, after = _recorded_and_new(source, output, places[middle], entries[middle])
-        few = spread(len(before), STRIP_FRAMES)
-        write_jpeg(root / PREVIEW, strip(list(before[few]), list(after[few])))
+        place = places[middle]
+        few = spread(int(output.episodes[place]["length"]), STRIP_FRAMES).tolist()
+        write_jpeg(root / PREVIEW, strip(*_recorded_and_new(source, output, place, entries[middle], few)))
 
 
 def _origin(
@@ -207,14 +207,18 @@ def _pictured(entries: Sequence[ViewEntry]) -> set[int]:
 
 def _pictures(source: LeRobotDatasetMetadata, output: LeRobotDatasetMetadata, index: int, entry: ViewEntry) -> Pictures:
     """Strip, clip and map of one view, from the two datasets' own pictures."""
-    before, after = _recorded_and_new(source, output, index, entry)
-    few, many = (spread(len(before), count) for count in (STRIP_FRAMES, CLIP_FRAMES))
-    moving = film(list(before[many]), list(after[many]))
+    length = int(output.episodes[index]["length"])
+    few, many = (spread(length, count).tolist() for count in (STRIP_FRAMES, CLIP_FRAMES))
+    middle = length // 2
+    wanted = sorted({*few, *many, middle})
+    before, after = (
+        dict(zip(wanted, frames, strict=True)) for frames in _recorded_and_new(source, output, index, entry, wanted)
+    )
+    moving = film([before[t] for t in many], [after[t] for t in many])
     scores = entry.view.get("scores")
-    middle = len(after) // 2
     heat = None if scores is None else data_url(heat_map(after[middle], scores["heat"]))
     return Pictures(
-        data_url(strip(list(before[few]), list(after[few]))),
+        data_url(strip([before[t] for t in few], [after[t] for t in few])),
         data_url(moving),
         len(many),
         moving.shape[1] / len(many) / moving.shape[0],
@@ -225,11 +229,15 @@ def _pictures(source: LeRobotDatasetMetadata, output: LeRobotDatasetMetadata, in
 
 
 def _recorded_and_new(
-    source: LeRobotDatasetMetadata, output: LeRobotDatasetMetadata, index: int, entry: ViewEntry
-) -> tuple[np.ndarray, np.ndarray]:
-    """All frames [t,h,w,3] of a view that was kept, recorded and new."""
+    source: LeRobotDatasetMetadata,
+    output: LeRobotDatasetMetadata,
+    index: int,
+    entry: ViewEntry,
+    frames: Sequence[int],
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Some frames [h,w,3], ascending, of a view that was kept, recorded and new."""
     recorded, new = (
-        read_colour(meta, number, entry.camera, read_rows(meta, number)).numpy()
+        list(read_colour(meta, number, entry.camera, read_rows(meta, number), frames).numpy())
         for meta, number in ((source, entry.episode), (output, index))
     )
     return recorded, new
