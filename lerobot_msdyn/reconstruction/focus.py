@@ -12,9 +12,10 @@ from torch import Tensor
 from lerobot_msdyn.core.config import FitConfig
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.core.sampling import scaled_window
-from lerobot_msdyn.core.visibility import footprints, projected
+from lerobot_msdyn.core.visibility import projected
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.footprints import footprints
 
 AROUND_PX = 8  # of 320: about what moves, by mask or by motion, that is looked at as well
 BY_PIXEL = {"rgb", "depth", "mask"}  # loss terms that leave out pixels that are not looked at

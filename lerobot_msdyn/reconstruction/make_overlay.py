@@ -15,11 +15,12 @@ from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.core.sampling import scaled_px
 from lerobot_msdyn.core.serialise import to_device
-from lerobot_msdyn.core.visibility import footprints, projected
+from lerobot_msdyn.core.visibility import projected
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.reconstruction.background import fill_depth, pixel_gaussians
 from lerobot_msdyn.render.cpu.threads import in_threads
 from lerobot_msdyn.scene.dynamic import DynamicScene, Snapshot, patched
+from lerobot_msdyn.scene.footprints import footprints
 from lerobot_msdyn.scene.overlay import FramePatch, Overlay, packed
 from lerobot_msdyn.scene.rendering import Rendering, render_scene, render_snapshot
 

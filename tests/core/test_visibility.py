@@ -1,11 +1,9 @@
 """Where points land in a picture, and whether it shows them."""
 
-import numpy as np
 import torch
 
-from lerobot_msdyn.core.cameras import intrinsics_from_fov, static_camera
-from lerobot_msdyn.core.visibility import footprints, projected
-from lerobot_msdyn.render import rasterize
+from lerobot_msdyn.core.cameras import static_camera
+from lerobot_msdyn.core.visibility import projected
 
 # 4 x 2 pixels, one pixel a metre at 1 m, the optical axis through the corner between the middle pixels
 CAMERA = static_camera(torch.tensor([[1.0, 0, 2], [0, 1, 1], [0, 0, 1]]), 1, 4, 2)
@@ -38,26 +36,3 @@ def test_a_point_is_visible_unless_it_lies_behind_the_surface_at_its_pixel() -> 
     assert projected(before_the_near_pixel, CAMERA).visible(depth, 0.0).tolist() == [True, False, False, False, False]
     before_the_far_pixel = torch.stack((0.5 * z, 0.5 * z, z), dim=-1)
     assert projected(before_the_far_pixel, CAMERA).visible(depth).all()
-
-
-def test_all_that_may_cover_some_pixels_is_found() -> None:
-    """Against the slow renderer: without the others, those pixels are the same."""
-    generator, count = torch.Generator().manual_seed(0), 400
-    camera = static_camera(intrinsics_from_fov(48, 32, 70.0), 1, 48, 32)
-    means = torch.rand(count, 3, generator=generator) * torch.tensor([4.0, 3, 3]) - torch.tensor([2, 1.5, 1])
-    scales = torch.rand(count, 3, generator=generator).pow(3) * 0.3 + 0.005
-    quats = torch.randn(count, 4, generator=generator)
-    colours, opacities = torch.rand(count, 3, generator=generator), torch.full((count,), 0.7)
-    where = np.zeros((32, 48), bool)
-    where[5:9, 30:35] = True
-    found = footprints(means, scales.amax(-1), camera).may_cover(where)
-    assert 0 < int(found.sum()) < 0.9 * int((means[:, 2] > 0).sum())
-
-    def shown(which: torch.Tensor) -> torch.Tensor:
-        picture = rasterize(
-            means[which], quats[which], scales[which], opacities[which], colours[which],
-            camera.camera_from_world, camera.intrinsics, 48, 32, near=0.01, backend="reference",
-        )  # fmt: skip
-        return picture.features[0][torch.from_numpy(where)]
-
-    torch.testing.assert_close(shown(found), shown(torch.ones_like(found)), atol=1e-6, rtol=0)
