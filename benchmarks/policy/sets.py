@@ -9,7 +9,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,6 +31,8 @@ FRONT, WRIST = "observation.images.front", "observation.images.wrist"
 RECORDED = "recorded"
 WITHOUT_JOINTS = "--camera.by_robot=false"
 WITH_JOINTS = ("--robot.name=so101",)
+FITTED = "product with joints"  # whose scenes other rows are rendered from
+ENDS = Path(__file__).with_name("ends.py")  # a plugin
 Episode = tuple["Demonstration", Iterable[np.ndarray]]  # and the front pictures [h, w, 3] of its frames
 
 
@@ -181,10 +183,12 @@ def front_pictures(dataset: "LeRobotDataset", episode: int) -> list[np.ndarray]:
     return list(decoded.permute(0, 2, 3, 1).numpy())
 
 
-def product(sets: Sets, path: Path, flags: tuple[str, ...] = (WITHOUT_JOINTS,), *, wide: bool = False) -> None:
+def product(
+    sets: Sets, path: Path, flags: tuple[str, ...] = (WITHOUT_JOINTS,), *, wide: bool = False, scenes_of: str = ""
+) -> None:
     """What the package's command makes of the recording, with its defaults but for the given flags.
 
-    `wide`: from poses of the oracle's range.
+    `wide`: from poses of the oracle's range. `scenes_of`: a row whose scenes are rendered; else they are fitted.
     """
     source = sets.folder(ROWS[RECORDED])
     given = [f"--root={source}", f"--new_root={path}", "--new_repo_id=local/policy_msdyn", "--repo=local/policy"]
@@ -195,6 +199,8 @@ def product(sets: Sets, path: Path, flags: tuple[str, ...] = (WITHOUT_JOINTS,), 
             f"--perturbation.translation_m={sets.form.range_m}",
             f"--perturbation.translation_rel={sets.form.range_m / DISTANCE_M:.2f}",
         ]
+    if scenes_of:
+        given += [f"--scenes={sets.folder(ROWS[scenes_of])}"]
     command = [sys.executable, "-m", "lerobot_msdyn.augment", *given]
     environment = os.environ | {"LEROBOT_MSDYN_CACHE": str(sets.store.root / "priors"), "HF_HUB_OFFLINE": "1"}
     log = sets.store.root / "augment.log"
@@ -238,45 +244,42 @@ ROWS: dict[str, Row] = {
     "oracle": Row("oracle", oracle),
     "homography": Row("homography", homography),
     "product": Row("product", product),
-    "product with joints": Row("product_joints", partial(product, flags=WITH_JOINTS)),
-    "product with joints, the oracle's range": Row(
-        "product_joints_wide", partial(product, flags=WITH_JOINTS, wide=True)
+    FITTED: Row("product_joints", partial(product, flags=(*WITH_JOINTS, "--save_scenes=true"))),
+    f"{FITTED}, the oracle's range": Row(
+        "product_joints_wide", partial(product, flags=(), wide=True, scenes_of=FITTED)
     ),
     "oracle at the product's poses": Row("oracle_product", partial(oracle_at_poses_of, "product")),
 }
 
 
-_many = partial(product, flags=(*WITH_JOINTS, "--variants=6"), wide=True)  # whose first n are those of n
+def _changed(name: str, *flags: str) -> Row:
+    """The product with joints, at the oracle's range, with some flags changed; nothing is fitted again."""
+    return Row(f"product_joints_{name}", partial(product, flags=flags, wide=True, scenes_of=FITTED))
 
 
 def _swept(name: str, field: str, values: Iterable[Any]) -> dict[str, Row]:
-    """Rows of the product with joints, at the oracle's range, with one flag changed."""
-    return {
-        f"{name} {value}": Row(
-            f"product_joints_{name}_{value}", partial(product, flags=(*WITH_JOINTS, f"--{field}={value}"), wide=True)
-        )
-        for value in values
-    }
+    return {f"{name} {value}": _changed(f"{name}_{value}", f"--{field}={value}") for value in values}
+
+
+_many = _changed("variants_10", "--variants=10")  # whose first n are those of n
 
 
 SWEEPS: dict[str, dict[str, Row]] = {
     "range": {
         "product": ROWS["product"],
         "product, the oracle's range": Row("product_wide", partial(product, wide=True)),
-        "product with joints": ROWS["product with joints"],
-        "product with joints, the oracle's range": ROWS["product with joints, the oracle's range"],
+        FITTED: ROWS[FITTED],
+        f"{FITTED}, the oracle's range": ROWS[f"{FITTED}, the oracle's range"],
     }
     | _swept("range", "perturbation.azimuth_deg", (5, 20, 30)),
     "sampling": {
         "oracle, one pose per frame": Row("oracle_per_frame", oracle_per_frame),
-        "one pose per frame": Row(
-            "product_joints_per_frame",
-            partial(product, flags=(*WITH_JOINTS, "--perturbation.per_frame=true"), wide=True),
-        ),
-        "without the recorded episodes": Row("product_joints_variants_6", _many, variants=2, source=False),
+        "one pose per frame": _changed("per_frame", "--perturbation.per_frame=true"),
+        "towards the ends": _changed("ends", f"--plugins={ENDS}", "--perturbation.type=ends"),
+        "without the recorded episodes": replace(_many, variants=2, source=False),
     },
-    "variants": {f"variants {n}": Row("product_joints_variants_6", _many, variants=n) for n in (1, 2, 4, 6)},
+    "variants": {f"variants {n}": replace(_many, variants=n) for n in (1, 2, 3, 6, 10)},
     "max_unseen": _swept("max_unseen", "max_unseen", (0.05, 0.1, 0.4, 1.0)),
-    "fill": _swept("fill", "fill", ("nearest", "none")),
+    "fill": _swept("fill", "fill", ("nearest", "none")) | {"crop": _changed("crop", "--crop_to_covered=true")},
     "gate": _swept("min_expected_db", "gate.min_expected_db", (0, 12, 16, 18)),
 }

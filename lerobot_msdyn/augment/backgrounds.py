@@ -107,7 +107,7 @@ def moving_in_episode(source: LeRobotDatasetMetadata, task: MaskTask) -> UInt8[n
 
 def background_episodes(source: LeRobotDatasetMetadata, recipe: Recipe) -> list[int]:
     """The episodes that `shared_backgrounds` looks at."""
-    if not recipe.scene.shared_background or source.total_episodes < 2:
+    if not recipe.scene.shared_background or source.total_episodes < 2 or recipe.scenes is not None:
         return []
     return looked_at(source.total_episodes)
 

@@ -1,17 +1,20 @@
 """How long a run will take, from a few frames and steps of its first episode that can be read."""
 
+import itertools
 import logging
 import shutil
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import torch
 from lerobot.datasets import LeRobotDatasetMetadata
 
-from lerobot_msdyn.augment.backgrounds import looked_at
+from lerobot_msdyn.augment.backgrounds import background_episodes
+from lerobot_msdyn.augment.earlier_scenes import earlier_scene
 from lerobot_msdyn.augment.episode import by_feature
 from lerobot_msdyn.augment.recorded import read_recorded
 from lerobot_msdyn.augment.report.build import PICTURED
@@ -21,6 +24,7 @@ from lerobot_msdyn.core.errors import EpisodeError, OutputError
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.dataset.encode import stage_pictures
 from lerobot_msdyn.reconstruction.reconstruct import FURTHER_STEPS, STEPS, Draft, reconstruct, with_steps
+from lerobot_msdyn.reconstruction.result import Reconstruction
 from lerobot_msdyn.render.devices import chosen_device
 from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.views.pictures import new_pictures, on_device
@@ -85,42 +89,57 @@ def measure_speeds(source: LeRobotDatasetMetadata, index: int, cameras: list[str
     views = episode.views
     if not recipe.needs_whole_videos:
         views = {key: _middle(view) for key, view in views.items()}
+    first = len(episode.time) // 2 - len(next(iter(views.values()))) // 2
     prepare_s = step_s = render_s = scene_bytes = frame_bytes = video_bytes = 0.0
     videos: list[str] = []
     for key, part in views.items():
-        ticks: list[float] = []
-
-        def tick(share: float, to: list[float] = ticks) -> None:
-            to.append(time.perf_counter())
-
-        others = [other for name, other in views.items() if name != key]
-        with time_spent_compiling() as compiling_s:  # once per machine, and not for each frame
-            start = time.perf_counter()
-            fit_s: list[float] = []
-
-            def fitted(draft: Draft, to: list[float] = fit_s, compiling_s: Callable[[], float] = compiling_s) -> None:
-                begin = time.perf_counter() - compiling_s()
-                STEPS["fit"](draft)
-                to.append(time.perf_counter() - compiling_s() - begin)
-
-            steps_watched = with_steps({"fit": fitted})
-            scene = reconstruct(part, short, tick, others=others, episode=index, key=key, steps=steps_watched)
-            prepare_s += (time.perf_counter() - start - compiling_s() - sum(fit_s)) / len(part.rgb)
-        steps = [
-            after - before for before, after in zip(ticks[WARM_UP_STEPS:], ticks[WARM_UP_STEPS + 1 :], strict=False)
-        ]
-        step_s += statistics.fmean(steps)
+        times = torch.arange(len(part.rgb))
+        if recipe.scenes is None:
+            others = [other for name, other in views.items() if name != key]
+            scene, of_priors, of_step = _timed_fit(part, short, others, index, key)
+            prepare_s, step_s = prepare_s + of_priors, step_s + of_step
+        else:
+            scene, times = earlier_scene(recipe.scenes, index, key), times + first
         once, each = _saved_sizes(scene.windows[0].scene)
         scene_bytes, frame_bytes = scene_bytes + once, frame_bytes + each
         with tempfile.TemporaryDirectory() as folder, time_spent_compiling() as compiling_s:
             start = time.perf_counter()
             scene_here = on_device(scene, chosen_device(recipe.device))
-            pictures = by_feature(source, {key: new_pictures(scene_here, part.camera)})
+            pictures = by_feature(source, {key: new_pictures(scene_here, scene.camera.select(times), times)})
             staged = stage_pictures(source, Path(folder), pictures, len(part.rgb))
             render_s += (time.perf_counter() - start - compiling_s()) / len(part.rgb)
             videos += staged.videos
             video_bytes += sum(file.stat().st_size for file in staged.videos.values()) / len(part.rgb)
     return Speeds(read_s, prepare_s, step_s, render_s, scene_bytes, frame_bytes, video_bytes, tuple(videos))
+
+
+def _timed_fit(
+    part: View, recipe: Recipe, others: Sequence[View], index: int, key: str
+) -> tuple[Reconstruction, float, float]:
+    """A camera's reconstruction, and the seconds that priors and initial scene take per frame, and a step of the fit.
+
+    Without what compiling takes: that is once per machine, and not for each frame.
+    """
+    ticks: list[float] = []
+    fit_s: list[float] = []
+    with time_spent_compiling() as compiling_s:
+        start = time.perf_counter()
+
+        def fitted(draft: Draft) -> None:
+            begin = time.perf_counter() - compiling_s()
+            STEPS["fit"](draft)
+            fit_s.append(time.perf_counter() - compiling_s() - begin)
+
+        def tick(share: float) -> None:
+            ticks.append(time.perf_counter())
+
+        scene = reconstruct(
+            part, recipe, tick, others=others, episode=index, key=key, steps=with_steps({"fit": fitted})
+        )
+        prepare_s = (time.perf_counter() - start - compiling_s() - sum(fit_s)) / len(part.rgb)
+    late = ticks[WARM_UP_STEPS:]
+    steps = [after - before for before, after in itertools.pairwise(late)]
+    return scene, prepare_s, statistics.fmean(steps)
 
 
 def predicted_output_bytes(source: LeRobotDatasetMetadata, episodes: list[int], recipe: Recipe) -> float:
@@ -200,9 +219,9 @@ def predicted_background_seconds(
     speeds: Speeds, source: LeRobotDatasetMetadata, episodes: list[int], recipe: Recipe, workers: int = 1
 ) -> float:
     """The part of it before any episode, in which what all share is made."""
-    if not _shares_background(source, recipe):
+    indices = background_episodes(source, recipe)
+    if not indices:
         return 0.0
-    indices = looked_at(source.total_episodes)
     apart = len(set(indices) - set(episodes))  # the masks of the others serve for their own fit as well
     masks_s = (len(indices) * speeds.read_s + apart * MASKS_SHARE * speeds.prepare_s) / workers
     each_s = len(indices) * speeds.read_s + masks_s
@@ -213,7 +232,7 @@ def predicted_episode_seconds(
     speeds: Speeds, source: LeRobotDatasetMetadata, episodes: list[int], recipe: Recipe, workers: int = 1
 ) -> float:
     """The part of it for episodes, some of a run's."""
-    steps = recipe.fit.steps * (FURTHER_STEPS if _shares_background(source, recipe) else 1.0)
+    steps = recipe.fit.steps * (FURTHER_STEPS if background_episodes(source, recipe) else 1.0)
     busy_s = [0.0] * workers
     for index in episodes:
         frames = int(source.episodes[index]["length"])
@@ -221,10 +240,6 @@ def predicted_episode_seconds(
         one_s = frames * (speeds.read_s + speeds.prepare_s + recipe.variants * speeds.render_s)
         busy_s[busy_s.index(min(busy_s))] += one_s + windows * steps * speeds.step_s
     return max(busy_s)
-
-
-def _shares_background(source: LeRobotDatasetMetadata, recipe: Recipe) -> bool:
-    return recipe.scene.shared_background and source.total_episodes > 1
 
 
 def _saved_sizes(scene: DynamicScene) -> tuple[float, float]:

@@ -12,6 +12,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from torch import Tensor
 
 from lerobot_msdyn.augment.backgrounds import Backgrounds
+from lerobot_msdyn.augment.earlier_scenes import earlier_scene
 from lerobot_msdyn.augment.recorded import read_recorded
 from lerobot_msdyn.augment.shown import steps_with_sheet, write_frame
 from lerobot_msdyn.core.config import GateConfig, Recipe
@@ -25,10 +26,10 @@ from lerobot_msdyn.dataset.staging import SCENE
 from lerobot_msdyn.dataset.write import NewEpisode, OutputDataset
 from lerobot_msdyn.priors.camera.path import displacement_px
 from lerobot_msdyn.reconstruction.account import account_line
+from lerobot_msdyn.reconstruction.on_disk import save_reconstruction
 from lerobot_msdyn.reconstruction.reconstruct import reconstruct
 from lerobot_msdyn.reconstruction.result import Reconstruction
 from lerobot_msdyn.render.devices import chosen_device
-from lerobot_msdyn.scene import store
 from lerobot_msdyn.scene.store import SceneSource
 from lerobot_msdyn.views.flashes import Flash, Flashes, largest_flash, too_large
 from lerobot_msdyn.views.gate import judge, reasons, record
@@ -76,6 +77,9 @@ def augment_episode(
     kept = output.episode(index)
     scenes, sheets = {}, {}
     for key, view in episode.views.items():
+        if recipe.scenes is not None:
+            scenes[key] = earlier_scene(recipe.scenes, index, key)
+            continue
         progress(f"episode {index}: fitting {key}", 0.0)
         sheets[key] = kept.folder / f"priors_{key}.jpg"
         make_scene = functools.partial(
@@ -104,7 +108,7 @@ def augment_episode(
         progress("", 0.5 / recipe.variants)
     if recipe.save_scenes:
         for key, scene in scenes.items():
-            store.save(scene.saved(SceneSource(source.repo_id, index, key, source.fps)), output.scenes)
+            save_reconstruction(scene, SceneSource(source.repo_id, index, key, source.fps), output.scenes)
     for key, scene in scenes.items():
         logger.info("episode %d, %s: %s", index, key, account_line(scene.account))
     return new

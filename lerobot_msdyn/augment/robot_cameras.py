@@ -190,7 +190,7 @@ def publish(folder: Path, place: Path) -> None:
 
 def calibration_episodes(source: LeRobotDatasetMetadata, config: Recipe) -> list[int]:
     """The episodes that tell where cameras stand, beside those that are worked on; none where that is known."""
-    wanted = config.camera.by_robot and config.camera.calibration is None
+    wanted = config.camera.by_robot and config.camera.calibration is None and config.scenes is None
     return looked_at(source.total_episodes) if wanted else []
 
 

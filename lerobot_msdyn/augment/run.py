@@ -3,7 +3,7 @@
 import contextlib
 import functools
 import logging
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import torch
@@ -13,6 +13,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 from lerobot_msdyn.augment.assumed_depth import say_assumed_depth
 from lerobot_msdyn.augment.backgrounds import background_episodes, background_worth
 from lerobot_msdyn.augment.config import AugmentConfig
+from lerobot_msdyn.augment.earlier_scenes import problems_of_scenes
 from lerobot_msdyn.augment.episode import augment_episode
 from lerobot_msdyn.augment.failures import same_reason
 from lerobot_msdyn.augment.plan import camera_lines
@@ -20,6 +21,7 @@ from lerobot_msdyn.augment.progress import EpisodeBar
 from lerobot_msdyn.augment.robot_cameras import calibrated
 from lerobot_msdyn.augment.run_identity import source_folder
 from lerobot_msdyn.augment.workers import Work, Workers, workers_for
+from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import EpisodeError, MsdynError
 from lerobot_msdyn.core.fields import AUTO
 from lerobot_msdyn.dataset.convert import named_as_given
@@ -46,7 +48,9 @@ def prepared(
     """
     chosen_device(config.device)  # complains, or says what is used, before anything is done
     check_named_providers(config.priors, config.camera, config.device)
-    problems = problems_of(source, episodes)
+    problems = problems_of(source, episodes, cameras, config)
+    if config.scenes is not None:
+        return config, problems
     whole = [index for index in episodes if index not in problems]
     if whole:
         config = calibrated(source, whole, cameras, config, output.staging.folder / CALIBRATION)
@@ -54,10 +58,15 @@ def prepared(
     return config, problems
 
 
-def problems_of(source: LeRobotDatasetMetadata, episodes: Iterable[int]) -> dict[int, str]:
-    """Why episodes cannot be read, as far as that is seen without opening their files."""
-    problems = {index: files_problem(source, index) for index in episodes}
-    return {index: problem for index, problem in problems.items() if problem}
+def problems_of(
+    source: LeRobotDatasetMetadata, episodes: Sequence[int], cameras: Sequence[str], config: Recipe
+) -> dict[int, str]:
+    """Why episodes cannot be read, or have no scenes where --scenes names some, without opening their files."""
+    files = {index: files_problem(source, index) for index in episodes}
+    problems = {index: problem for index, problem in files.items() if problem}
+    if config.scenes is None:
+        return problems
+    return problems_of_scenes(source, episodes, cameras, config.scenes) | problems
 
 
 def run_local(

@@ -17,6 +17,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
 from lerobot_msdyn.augment.config import AugmentConfig
+from lerobot_msdyn.augment.earlier_scenes import digests_of_scenes
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.fields import PARAMETER
 from lerobot_msdyn.core.files import DIGEST_BYTES, digest_of_file
@@ -48,6 +49,7 @@ def describe_run(root: Path, files: Iterable[Path], config: AugmentConfig) -> di
         "recipe": settings,
         "device": chosen_device(config.device).type,
         "source": {str(path.relative_to(root)): digest_of_file(path) for path in files},
+        "scenes": {} if config.scenes is None else digests_of_scenes(config.scenes),
         "files": {str(path): digest_of_file(path) for path in _named_files(settings)},
         "plugins": plugin_digests(),
         "versions": versions() | extending_packages() | {"code": code_digest()},

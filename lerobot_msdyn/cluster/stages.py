@@ -107,7 +107,7 @@ def episodes(job: Job, rank: int, world_size: int) -> Iterator[Progress]:
     config = calibrated_before(config, staging.folder / CALIBRATION)
     work = Work(source, shared["cameras"], config, output, _no_progress)
     with terse(config):
-        for index, failure in attempts(work, unfinished, problems_of(source, unfinished)):
+        for index, failure in attempts(work, unfinished, problems_of(source, unfinished, work.cameras, config)):
             if failure is not None:
                 logger.error("skipped: %s", failure)
                 output.episode(index).say_failed(failure)

@@ -53,7 +53,7 @@ WORTH_KEEPING = (SCENE, "variant", FINISHED)  # what takes long to make of an ep
 STOPPED = (KeyboardInterrupt, OutputError, WorkerError)  # ends of a run that the same command can go on from
 MAX_NAMED = 5  # differences that a message lists
 CODE_CHANGED = "the code of lerobot_msdyn has changed"
-FILES = ("source", "files", "plugins")  # parts of the description whose values are digests of files
+FILES = ("source", "scenes", "files", "plugins")  # parts of the description whose values are digests of files
 
 
 def work_folder(root: Path) -> Path:

@@ -17,7 +17,7 @@ from lerobot_msdyn.core.config import RIVAL_LEVELS
 from lerobot_msdyn.core.errors import ConfigError, MsdynError
 from lerobot_msdyn.core.files import writing
 from lerobot_msdyn.core.perturbation import LEVEL
-from lerobot_msdyn.core.serialise import from_named_tensors, named_tensors, read_tensors, write_tensors
+from lerobot_msdyn.core.serialise import from_named_tensors, named_tensors, read_tensors, save_value, write_tensors
 from lerobot_msdyn.motion.model.bases import MotionLevel
 from lerobot_msdyn.motion.spec import level_spec
 from lerobot_msdyn.scene.dynamic import DynamicScene
@@ -73,8 +73,10 @@ def camera_folder(root: Path, episode: int, camera: str) -> Path:
     return root / f"episode_{episode:06d}" / camera
 
 
-def save(scene: SavedScene, root: Path) -> Path:
+def save(scene: SavedScene, root: Path, beside: Mapping[str, object] | None = None) -> Path:
     """Write a scene below a folder of scenes, replacing one that is there; returns its own folder.
+
+    `beside`: further values (`serialise.save_value`) in that folder, by the names of their files.
 
     Raises:
         OutputError: it cannot be written.
@@ -100,6 +102,8 @@ def save(scene: SavedScene, root: Path) -> Path:
         for number, window in enumerate(scene.windows):
             save_scene(window, partial / _WINDOW.format(number))
         write_tensors(partial / _CAMERA, named_tensors(scene.camera))
+        for name, value in (beside or {}).items():
+            save_value(partial / name, value, partial)
         (partial / _HEADER).write_text(json.dumps(header, indent=1), encoding="utf-8")
         shutil.rmtree(folder, ignore_errors=True)
         partial.rename(folder)
