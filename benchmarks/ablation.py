@@ -12,7 +12,7 @@ prints the table of what FILE holds and plots it as docs/images/ablation.svg.
 
 PSNR (dB) of a picture is over the pixels that the recorded camera has seen at some time (`all`), those of bodies that
 move (`moving`), and those it saw only at another time (`disoccluded`); figures are means over cameras and frames.
-Rows are without overlay, which hides errors of motion, unless they say so.
+Rows are without short-lived Gaussians and overlay, which hide errors of motion, unless they say so.
 
 L1, L1+L2, L1+L2+ (ten primitives), L1-L3 and L4 (particles) are the paper's: an object is an instance, and all levels
 are fitted to the tracks and kept. `of parts`: an instance is split into rigid parts first. `the method` is what the
@@ -44,7 +44,7 @@ from jaxtyping import UInt8
 from numpy import ndarray
 
 from lerobot_msdyn.core.cli import load_recipe
-from lerobot_msdyn.core.config import DensityConfig, LearnConfig, Recipe
+from lerobot_msdyn.core.config import DensityConfig, LearnConfig, Recipe, SceneConfig
 from lerobot_msdyn.core.files import write_whole
 from lerobot_msdyn.evaluate.metrics import masked_psnr_db
 from lerobot_msdyn.priors import Priors, estimate_priors
@@ -64,6 +64,7 @@ TRACKS = {"gate": False, "register": False}  # levels are fitted to the tracks, 
 PAPER = TRACKS | {"max_parts": 1}  # and an object is an instance
 
 
+SHORT_LIVED = {"short_lived": SceneConfig().short_lived}
 LEARNED = {"learn": LearnConfig(bases=True, begin=0.0)}
 
 
@@ -99,7 +100,8 @@ ROWS = (
     Row("L1 of parts", TRACKS | {"levels": ["object"]}),
     Row("L1-L3 of parts", TRACKS | {"levels": ALL}),
     Row("the method: registered, gated", {"levels": ALL}),
-    Row("the method with overlay", {"levels": ALL}, {"overlay": True}),
+    Row("the method with short-lived Gaussians", {"levels": ALL}, SHORT_LIVED),
+    Row("the method with overlay", {"levels": ALL}, SHORT_LIVED | {"overlay": True}),
 )
 
 
@@ -151,7 +153,7 @@ def recipe_of(row: Row, settings: Settings, seed: int) -> Recipe:
     """A row's recipe with its changes."""
     recipe = replace(load_recipe(row.recipe) if row.recipe else Recipe(), seed=seed)
     recipe.priors.cache = "off"
-    recipe.scene = replace(recipe.scene, **({"overlay": False} | row.scene))
+    recipe.scene = replace(recipe.scene, **({"overlay": False, "short_lived": 0} | row.scene))
     recipe.motion = replace(recipe.motion, **row.motion)
     weights = recipe.fit.weights | row.weights
     recipe.fit = replace(recipe.fit, steps=settings.steps, max_width=settings.width, weights=weights, **row.fit)

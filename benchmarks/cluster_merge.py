@@ -127,7 +127,7 @@ def _same(value: Any) -> Any:
 
 def _provenance(index: int) -> Provenance:
     """The record of a view that was judged."""
-    account = Account(MovingPixels(900, 100, 10), 0.01, 0.02, held_out=False).entry()
+    account = Account(MovingPixels(900, 50, 50, 10), 0.01, 0.02, held_out=False).entry()
     frames = [FrameScores(frame, 25.0, 0.01, 4.0, 1.0) for frame in range(JUDGED)]
     causes = {"video": 1e-3, "geometry": 2e-3, "depth": 0.0, "sampling": 1e-4}
     heat = [[column % 7 for column in range(HEAT_WIDTH)] for _ in range(HEAT_WIDTH * HEIGHT // WIDTH)]

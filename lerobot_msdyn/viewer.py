@@ -233,7 +233,7 @@ def _log_gaussians(log: _Log, scene: "SavedScene") -> None:
             for number, (index, logit) in enumerate(zip(window.indices, window.logits, strict=True))
         }
         for frame in range(window.frames):
-            moving = gaussians_at(replace(window, overlay=None), frame).select(slice(count, None))
+            moving = gaussians_at(window.without_patches(), frame).select(slice(count, None))
             log.at(start + frame, "world/moving/points", _points(moving.means, moving.rgb, moving.scales))
             log.at(
                 start + frame, "world/moving/ellipsoids",
@@ -245,9 +245,12 @@ def _log_gaussians(log: _Log, scene: "SavedScene") -> None:
                     fill_mode="solid",
                 ),
             )  # fmt: skip
-            if window.overlay is not None:
-                patch = window.overlay.patch(frame, count + len(moving))
-                log.at(start + frame, "world/overlay", _points(patch.means, patch.rgb, patch.log_scales.exp()))
+            patch = window.patch(frame)
+            if patch is not None:
+                lasting, single = slice(patch.short_lived), slice(patch.short_lived, None)
+                for name, rows in (("short_lived", lasting), ("overlay", single)):
+                    points = _points(patch.means[rows], patch.rgb[rows], patch.log_scales[rows].exp())
+                    log.at(start + frame, f"world/{name}", points)
             for name, colours in by_level.items():
                 log.at(start + frame, f"world/motion/{name}", rr.Points3D(moving.means.numpy(), colors=colours))
 

@@ -35,7 +35,12 @@ PROBE_FRAMES = 24
 PROBE_STEPS = 13  # after those that warm up, two rounds of looks at the whole picture and near what moves
 REPORT_BYTES = 3e5  # of the report, for each view with pictures
 MASKS_SHARE = 0.3  # of the time of priors and initial scene
-GROWING = ("overlay.", "shading.field", "shading.moving")  # tensors of a scene with a part for every frame
+GROWING = (
+    "short_lived.",
+    "overlay.",
+    "shading.field",
+    "shading.moving",
+)  # tensors of a scene with a part for every frame
 WARM_UP_STEPS = 4  # the first ones compile, and fill caches
 
 

@@ -138,7 +138,10 @@ class SceneConfig:
     mask_border_px: int = between(1, 0, 100)
     # Side of the voxels in which the gathered moving points are merged, in pixels of the fitted image.
     moving_voxel_px: float = between(0.8, 0.05, 100)
-    # Whether what the motion does not explain of a frame is shown as it was recorded, at that frame.
+    # Frames to either side in which what the motion does not explain of a frame is shown as well, carried by the motion
+    # of what is nearest, where they agree; 0: in none.
+    short_lived: int = between(2, 0, 100)
+    # Whether what is not explained then is shown as it was recorded, at its own frame.
     overlay: bool = True
     # Balls instead of ellipsoids.
     isotropic: bool = False

@@ -72,9 +72,10 @@ def evaluate_nvs(config: EvaluateConfig) -> Evaluated:
                 cameras[path.stem] = score_views(rendered, truth, lpips)
                 held_out[path.stem] = HeldOut(camera, frames, truth)
         if truth is not None and truth.moving is not None:
-            with timed(seconds, "render without overlay"):
-                alone = _render(scene.without_overlay(), camera, frames)
-            account = {"dyn_psnr_without_overlay": dynamic_psnr_db(alone, truth)}
+            with timed(seconds, "render without overlay, and by motion alone"):
+                others = {"without_overlay": scene.without_overlay(), "by_motion": scene.by_motion_alone()}
+                pictures_of = {name: _render(other, camera, frames) for name, other in others.items()}
+            account = {f"dyn_psnr_{name}": dynamic_psnr_db(shown, truth) for name, shown in pictures_of.items()}
             cameras[path.stem] |= account | source_shares(scene, camera, frames, truth)
     rows = cameras | {"mean": mean_scores([*cameras.values()])}
     notices = (

@@ -2,8 +2,8 @@
 
 The moving pixels of a camera that was not fitted are those that truly show something that moves (of a calibrated rig:
 those that its masks call moving), as far as the recorded camera has seen them. `dyn_psnr` is over them, of views as
-they are rendered; `dyn_psnr_without_overlay` of views without overlays; `by_*` is the share of them that each source
-renders (`scene.sources`), of all frames together.
+they are rendered; `dyn_psnr_without_overlay` of views without overlays, `dyn_psnr_by_motion` without short-lived
+Gaussians either; `by_*` is the share of them that each source renders (`scene.sources`), of all frames together.
 """
 
 import json
@@ -35,7 +35,9 @@ NAMES = {  # score -> its column
     "ssim": "SSIM",
     "dyn_psnr": "dynamic PSNR",
     "dyn_psnr_without_overlay": "without overlay",
+    "dyn_psnr_by_motion": "motion alone",
     "by_motion": "by motion",
+    "by_short_lived": "by short-lived",
     "by_overlay": "by overlay",
     "by_background": "by background",
     "dyn_ssim": "dynamic SSIM",

@@ -1,9 +1,10 @@
 """Who renders what moves: motion, or recorded pixels; and how far off each is, over the frames of the self-check.
 
 A moving pixel is one of the recorded camera that the masks call moving; `scene.sources` says what renders it. Dynamic
-PSNR is the PSNR over these pixels. An overlay is made from all frames, the checked ones too: with it, recorded pixels
-are compared with themselves, so that only the PSNR without it tells how well motion is understood. What overlays are
-worth from elsewhere is measured by held-out cameras (`python -m lerobot_msdyn.evaluate nvs`).
+PSNR is the PSNR over these pixels. Patches (short-lived Gaussians, overlay) are made from all frames, the checked ones
+too: with them, recorded pixels are compared with themselves, so that only the PSNR by motion alone tells how well
+motion is understood. What patches are worth from elsewhere is measured by held-out cameras (`python -m
+lerobot_msdyn.evaluate nvs`).
 """
 
 import math
@@ -29,7 +30,7 @@ class Account:
 
     pixels: MovingPixels
     error: float  # mean square over the moving pixels, colours 0..1, as new views are rendered; 0 where nothing moves
-    error_without_overlay: float  # the same by motion and background alone
+    error_by_motion: float  # the same by motion and background alone
     held_out: bool  # whether the fit never saw these frames
 
     @property
@@ -38,9 +39,9 @@ class Account:
         return decibels(self.error) if self.pixels.total > 0 else math.nan
 
     @property
-    def dynamic_without_overlay_db(self) -> float:
+    def dynamic_by_motion_db(self) -> float:
         """The same by motion and background alone."""
-        return decibels(self.error_without_overlay) if self.pixels.total > 0 else math.nan
+        return decibels(self.error_by_motion) if self.pixels.total > 0 else math.nan
 
     def entry(self) -> dict[str, Any]:
         """For files: plain values, rounded; no dynamic PSNR (null) where nothing moves."""
@@ -49,17 +50,17 @@ class Account:
             "pixels": self.pixels.total,
             **{name: round(share, 4) for name, share in self.pixels.shares.items()},
             "dynamic_db": round(self.dynamic_db, 2) if moves else None,
-            "dynamic_without_overlay_db": round(self.dynamic_without_overlay_db, 2) if moves else None,
+            "dynamic_by_motion_db": round(self.dynamic_by_motion_db, 2) if moves else None,
             "held_out": self.held_out,
         }
 
     @staticmethod
     def from_entry(entry: dict[str, Any]) -> "Account":
         """The account that an `entry` was made of, up to rounding."""
-        shares = (entry["by_motion"], entry["by_overlay"], entry["by_background"])
+        shares = (entry.get(name, 0.0) for name in MovingPixels().shares)  # earlier versions had fewer kinds
         pixels = MovingPixels(*(round(entry["pixels"] * share) for share in shares))
         shown, alone = (
-            0.0 if db is None else 10 ** (-db / 10) for db in (entry["dynamic_db"], entry["dynamic_without_overlay_db"])
+            0.0 if db is None else 10 ** (-db / 10) for db in (entry["dynamic_db"], entry["dynamic_by_motion_db"])
         )
         return Account(pixels, shown, alone, entry["held_out"])
 
@@ -75,7 +76,7 @@ def pooled(accounts: Sequence[Account]) -> Account:
     return Account(
         pixels,
         mean([account.error for account in accounts]),
-        mean([account.error_without_overlay for account in accounts]),
+        mean([account.error_by_motion for account in accounts]),
         all(account.held_out for account in accounts),
     )
 
@@ -84,11 +85,12 @@ def account_line(account: Account) -> str:
     """An account in one line, for logs and terminals."""
     if account.pixels.total == 0:
         return "what moves: nothing, in the frames that were checked"
-    motion, overlay, background = (f"{100 * share:.0f} %" for share in account.pixels.shares.values())
+    motion, lasting, overlay, background = (f"{100 * share:.0f} %" for share in account.pixels.shares.values())
     missed = f", {background} by the background" if account.pixels.shares["by_background"] >= NAMED_FROM else ""
     return (
-        f"what moves: {motion} of its pixels rendered by motion, {overlay} by overlay (recorded pixels){missed}; "
-        f"dynamic PSNR {account.dynamic_db:.1f} dB, {account.dynamic_without_overlay_db:.1f} without overlay"
+        f"what moves: {motion} of its pixels rendered by motion, {lasting} by short-lived Gaussians, {overlay} by "
+        f"overlay (recorded pixels){missed}; "
+        f"dynamic PSNR {account.dynamic_db:.1f} dB, {account.dynamic_by_motion_db:.1f} by motion alone"
     )
 
 
@@ -96,11 +98,12 @@ def account_sentence(account: Account) -> str:
     """An account in words, for readers who know none of its terms."""
     if account.pixels.total == 0:
         return "nothing moves in the frames that were checked."
-    motion, overlay, background = (f"{100 * share:.0f} %" for share in account.pixels.shares.values())
+    motion, lasting, overlay, background = (f"{100 * share:.0f} %" for share in account.pixels.shares.values())
     frames = "held-out frames" if account.held_out else "a few frames"
     return (
-        f"of the pixels that show something moving, {motion} are rendered by motion, {overlay} are recorded pixels "
-        f"shown at their own frame (overlay), and {background} show the background. Over them, on {frames} of the "
-        f"recorded view, PSNR is {account.dynamic_db:.1f} dB, and {account.dynamic_without_overlay_db:.1f} dB without "
-        "the overlay: the latter tells how well motion is understood."
+        f"of the pixels that show something moving, {motion} are rendered by motion, {lasting} are recorded pixels "
+        f"carried over a few frames (short-lived), {overlay} are shown at their own frame alone (overlay), and "
+        f"{background} show the background. Over them, on {frames} of the recorded view, PSNR is "
+        f"{account.dynamic_db:.1f} dB, and {account.dynamic_by_motion_db:.1f} dB by motion alone: the latter tells how "
+        "well motion is understood."
     )

@@ -34,13 +34,21 @@ def enlarged(scene: DynamicScene, camera: CameraTrack, ratio: float) -> DynamicS
         replace(part, log_scales=_widened(part.log_scales, added * _depth(part.means, poses[:1])))
         for part in (scene.static, scene.moving)
     )
-    overlay = scene.overlay
+    overlay, short = scene.overlay, scene.short_lived
+    if short is not None:
+        far = torch.zeros(len(short.means), device=scene.device)
+        for frame in range(scene.frames):
+            patch = scene.short_lived_patch(frame)
+            if patch is not None:
+                far[short.rows(frame)] = _depth(patch.means, poses[frame : frame + 1])
+        wider = _widened(short.log_scales.float(), added * far).to(short.log_scales)
+        short = replace(short, log_scales=wider)
     if overlay is not None:
-        frame = torch.repeat_interleave(torch.arange(len(overlay.first) - 1), overlay.first.diff().cpu())
-        depth = _depth(overlay.means, poses.to(overlay.means.device)[frame])
+        of_rows = torch.repeat_interleave(torch.arange(len(overlay.first) - 1), overlay.first.diff().cpu())
+        depth = _depth(overlay.means, poses.to(overlay.means.device)[of_rows])
         wider = _widened(overlay.log_scales.float(), added * depth).to(overlay.log_scales)
         overlay = replace(overlay, log_scales=wider)
-    return replace(scene, static=static, moving=moving, overlay=overlay)
+    return replace(scene, static=static, moving=moving, short_lived=short, overlay=overlay)
 
 
 def _depth(means: Float[Tensor, "n 3"], poses: Float[Tensor, "#n 4 4"]) -> Float[Tensor, " n"]:

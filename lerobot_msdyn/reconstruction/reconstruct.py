@@ -27,7 +27,8 @@ from lerobot_msdyn.reconstruction.evidence import Evidence, evidence_of
 from lerobot_msdyn.reconstruction.fit import FitResult, fit
 from lerobot_msdyn.reconstruction.initialise import initialise
 from lerobot_msdyn.reconstruction.key_views import KeyView, fixed_view, key_views
-from lerobot_msdyn.reconstruction.make_overlay import unexplained
+from lerobot_msdyn.reconstruction.make_overlay import overlay_of
+from lerobot_msdyn.reconstruction.make_short_lived import short_lived_of
 from lerobot_msdyn.reconstruction.pooled_background import SharedBackground, adapted, completed
 from lerobot_msdyn.reconstruction.prune import without_contradicted
 from lerobot_msdyn.reconstruction.result import FittedWindow, Reconstruction
@@ -156,10 +157,18 @@ def _evidence(draft: Draft) -> None:
     draft.evidence = evidence_of(draft.scene, draft.view.camera, draft.keys)
 
 
+def _short_lived(draft: Draft) -> None:
+    """What the scene does not explain of some frames, for a few frames."""
+    reach = draft.recipe.scene.short_lived
+    if reach > 0:
+        short_lived = short_lived_of(draft.scene, draft.view, draft.priors, reach)
+        draft.scene = replace(draft.scene, short_lived=short_lived)
+
+
 def _overlay(draft: Draft) -> None:
     """Recorded pixels of single frames that the scene does not explain."""
     if draft.recipe.scene.overlay:
-        draft.scene = replace(draft.scene, overlay=unexplained(draft.scene, draft.view, draft.priors))
+        draft.scene = replace(draft.scene, overlay=overlay_of(draft.scene, draft.view, draft.priors))
 
 
 def _self_check(draft: Draft) -> None:
@@ -181,6 +190,7 @@ STEPS: dict[str, Step] = {
     "fit": _fit,
     "prune": _prune,
     "evidence": _evidence,
+    "short-lived": _short_lived,
     "overlay": _overlay,
     "self-check": _self_check,
     "antialias": _antialias,

@@ -1,6 +1,6 @@
 """One camera's reconstruction: what new views of an episode are rendered from and judged by."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -56,8 +56,15 @@ class Reconstruction:
         return pooled([window.self_check.account for window in self.windows])
 
     def without_overlay(self) -> "Reconstruction":
+        """The same without the recorded pixels of single frames."""
+        return self._with_scenes(lambda scene: replace(scene, overlay=None))
+
+    def by_motion_alone(self) -> "Reconstruction":
         """The same rendered by motion and background alone."""
-        windows = (replace(window, scene=replace(window.scene, overlay=None)) for window in self.windows)
+        return self._with_scenes(DynamicScene.without_patches)
+
+    def _with_scenes(self, change: Callable[[DynamicScene], DynamicScene]) -> "Reconstruction":
+        windows = (replace(window, scene=change(window.scene)) for window in self.windows)
         return replace(self, windows=tuple(windows))
 
     def stretches(self, frames: Int[Tensor, " t"]) -> Iterator[tuple[FittedWindow, slice]]:

@@ -6,7 +6,7 @@ them is judged with it, and what the scene alone makes of frames that it never s
 """
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import kornia
@@ -57,8 +57,8 @@ class SelfCheck:
 
     @property
     def moving_error(self) -> float:
-        """Mean square colour error of what moves without the overlay, 0..1; 0 where nothing does."""
-        return self.account.error_without_overlay
+        """Mean square colour error of what moves by motion alone, 0..1; 0 where nothing does."""
+        return self.account.error_by_motion
 
 
 @torch.no_grad()
@@ -74,7 +74,7 @@ def self_check(scene: DynamicScene, view: View, priors: Priors, held_out: Int[Te
     camera = view.camera.select(frames)
     rendering = to_device(render_scene(scene, camera, frames), "cpu")
     recorded = view.rgb[frames].float() / 255
-    alone = render_scene(replace(scene, overlay=None), camera, frames).rgb.clamp(0, 1).cpu()
+    alone = render_scene(scene.without_patches(), camera, frames).rgb.clamp(0, 1).cpu()
     moving = priors.instances[frames] > 0
     error = (rendering.rgb.clamp(0, 1) - recorded).square().mean(-1)
     error_alone = (alone - recorded).square().mean(-1)

@@ -12,6 +12,7 @@ from lerobot_msdyn.scene.gaussians import Gaussians
 from lerobot_msdyn.scene.overlay import PATCH_OPACITY, FramePatch, Overlay
 from lerobot_msdyn.scene.seen import shaded_moving
 from lerobot_msdyn.scene.shading import Shading
+from lerobot_msdyn.scene.short_lived import STILL, ShortLived
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,7 @@ class DynamicScene:
     frames: int
     shading: Shading | None = None  # none: brightness does not change
     near: float = 0.01  # m; nothing that is as near to a camera is rendered
+    short_lived: ShortLived | None = None  # none: nothing lives for a few frames alone
     overlay: Overlay | None = None  # none: nothing is shown as it was recorded
     canonical_frame: int = 0  # at which all bases are the identity; of use to the fit alone, files do not keep it
 
@@ -62,19 +64,63 @@ class DynamicScene:
         return self.static.means.device
 
     def select_static(self, which: Tensor | slice) -> "DynamicScene":
-        """The same with some Gaussians of the static set, by index, mask or slice; of a scene without an overlay."""
+        """The same with some Gaussians of the static set, by index, mask or slice; of a scene without patches."""
         shading = None if self.shading is None else replace(self.shading, places=self.shading.places[which])
         return replace(self, static=self.static.select(which), shading=shading)
 
     def select_moving(self, which: Tensor | slice) -> "DynamicScene":
-        """The same with some Gaussians of the moving set, by index, mask or slice; of a scene without an overlay."""
+        """The same with some Gaussians of the moving set, by index, mask or slice; of a scene without patches."""
         shading = None if self.shading is None else replace(self.shading, moving=self.shading.moving[:, which])
-        indices, logits = (tuple(rows[which] for rows in levels) for levels in (self.indices, self.logits))
+        indices, logits = self.followed_by(which)
         return replace(self, moving=self.moving.select(which), indices=indices, logits=logits, shading=shading)
 
     def still(self) -> "DynamicScene":
-        """The same without what moves and without an overlay: the static set, its brightness and the near plane."""
-        return replace(self.select_moving(slice(0)), levels=(), indices=(), logits=(), overlay=None)
+        """The same without what moves and without patches: the static set, its brightness and the near plane."""
+        return replace(self.select_moving(slice(0)).without_patches(), levels=(), indices=(), logits=())
+
+    def without_patches(self) -> "DynamicScene":
+        """What its two sets alone show."""
+        return replace(self, short_lived=None, overlay=None)
+
+    def patch(self, frame: int) -> FramePatch | None:
+        """What a frame shows beside the two sets: short-lived Gaussians, an overlay; None if there is neither."""
+        short = self.short_lived_patch(frame)
+        if self.overlay is None:
+            return short
+        own = len(self.static) + len(self.moving)
+        if short is None:
+            return self.overlay.patch(frame, own)
+        single = self.overlay.patch(frame, own + len(short))
+        kept = (~single.hidden[own:]).nonzero()[:, 0]
+        return FramePatch(
+            torch.cat((short.means[kept], single.means)),
+            torch.cat((short.quats[kept], single.quats)),
+            torch.cat((short.log_scales[kept], single.log_scales)),
+            torch.cat((short.rgb[kept], single.rgb)),
+            short.hidden | single.hidden[:own],
+            len(kept),
+        )
+
+    def short_lived_patch(self, frame: int) -> FramePatch | None:
+        """The short-lived Gaussians that a frame shows, where they are then; None where the scene has none."""
+        short = self.short_lived
+        if short is None:
+            return None
+        rows = short.rows(frame)
+        carrier, means, quats = short.carrier[rows].long(), short.means[rows], short.quats[rows].float()
+        if len(self.moving) > 0:
+            when = torch.tensor([frame], device=self.device)
+            indices, logits = self.followed_by(carrier.clamp(min=0))
+            moved, turned = compose(means, quats, self.levels, indices, logits, when)
+            still = (carrier == STILL)[:, None]
+            means, quats = torch.where(still, means, moved[0]), torch.where(still, quats, turned[0])
+        own = len(self.static) + len(self.moving)
+        log_scales, rgb = short.log_scales[rows].float(), short.rgb[rows].float()
+        return FramePatch(means, quats, log_scales, rgb, short.hidden_at(frame, own), len(rows))
+
+    def followed_by(self, which: Tensor | slice) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+        """Indices and logits per level of some of the moving set."""
+        return tuple(rows[which] for rows in self.indices), tuple(rows[which] for rows in self.logits)
 
     def at(self, frames: Int[Tensor, " b"], eye: Float[Tensor, "b 3"] | None = None) -> Snapshot:
         """The scene at some frames, differentiable in all Gaussians and bases.
@@ -102,7 +148,7 @@ class DynamicScene:
 
     def tensors(self) -> dict[str, Tensor]:
         """All that the scene is made of, by the names of its file."""
-        sets = {"static": self.static, "moving": self.moving, "shading": self.shading, "overlay": self.overlay}
+        sets = {name: getattr(self, name) for name in ("static", "moving", "shading", "short_lived", "overlay")}
         bindings = [{"indices": index, "logits": row} for index, row in zip(self.indices, self.logits, strict=True)]
         return named_tensors(sets) | named_tensors(self.levels, "levels") | named_tensors(bindings, "levels")
 

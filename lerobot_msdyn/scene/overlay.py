@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float16, Int, UInt8
 from torch import Tensor
+
+from lerobot_msdyn.core.bits import packed_rows, unpacked
 
 PATCH_OPACITY = 0.95  # of the Gaussians
 
@@ -20,6 +21,7 @@ class FramePatch:
     log_scales: Float[Tensor, "n 3"]  # log of standard deviations in m
     rgb: Float[Tensor, "n 3"]  # 0..1
     hidden: Bool[Tensor, " g"]  # the scene's Gaussians, static ones first, that are not rendered
+    short_lived: int = 0  # how many of them, the first ones, other frames show as well
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -27,7 +29,10 @@ class FramePatch:
 
 @dataclass(frozen=True)
 class Overlay:
-    """The patches of all frames, one behind the other; 32 bytes a Gaussian, and a bit for each of the scene's own."""
+    """The patches of all frames, one behind the other; 32 bytes a Gaussian, and a bit for each of the scene's own.
+
+    Of what is hidden, the scene's short-lived Gaussians that the frame shows come behind its others.
+    """
 
     first: Int[Tensor, " t1"]  # frame i has the rows first[i] to first[i + 1]
     means: Float[Tensor, "n 3"]
@@ -39,14 +44,12 @@ class Overlay:
     def patch(self, frame: int, gaussians: int) -> FramePatch:
         """The patch of a frame of a scene with so many Gaussians of its own."""
         rows = self.rows(frame)
-        places = torch.arange(7, -1, -1, dtype=torch.uint8, device=self.hidden.device)
-        bits = (self.hidden[frame][:, None] >> places) & 1
         return FramePatch(
             self.means[rows],
             self.quats[rows].float(),
             self.log_scales[rows].float(),
             self.rgb[rows].float(),
-            bits.bool().flatten()[:gaussians],
+            unpacked(self.hidden[frame], gaussians),
         )
 
     def rows(self, frame: int) -> slice:
@@ -61,7 +64,6 @@ class Overlay:
 
 def packed(patches: list[FramePatch]) -> Overlay:
     """One overlay of the patches of all frames of a scene."""
-    hidden = np.stack([np.packbits(patch.hidden.numpy()) for patch in patches])
     sizes = torch.tensor([0, *(len(patch) for patch in patches)])
     return Overlay(
         first=sizes.cumsum(0),
@@ -69,5 +71,5 @@ def packed(patches: list[FramePatch]) -> Overlay:
         quats=torch.cat([patch.quats for patch in patches]).to(torch.float16),
         log_scales=torch.cat([patch.log_scales for patch in patches]).to(torch.float16),
         rgb=torch.cat([patch.rgb for patch in patches]).to(torch.float16),
-        hidden=torch.from_numpy(hidden),
+        hidden=packed_rows([patch.hidden for patch in patches]),
     )

@@ -39,9 +39,9 @@ def gaussians_at(scene: DynamicScene, frame: int) -> Gaussians:
             Gaussians(means[0], quats[0], log_scales[1], moving.opacity_logits, sh[1]),
         ]
     )
-    if scene.overlay is None:
+    patch = scene.patch(frame)
+    if patch is None:
         return whole
-    patch = scene.overlay.patch(frame, len(whole))
     shown = gaussians_from_points(patch.means, patch.quats, patch.log_scales.exp(), patch.rgb, PATCH_OPACITY)
     flat = torch.nn.functional.pad(shown.sh, (0, 0, 0, degree - 1))
     return concatenate([whole.select(~patch.hidden), replace(shown, sh=flat)])

@@ -24,7 +24,7 @@ class Rendering:
     rgb: Float[Tensor, "t h w 3"]  # 0..1, over black
     depth: Float[Tensor, "t h w"]  # m, expected z-depth; 0 where nothing is
     alpha: Float[Tensor, "t h w"]  # 0..1
-    moving: Float[Tensor, "t h w"]  # 0..1, share of the moving set and of overlays
+    moving: Float[Tensor, "t h w"]  # 0..1, share of the moving set and of patches
     extra: Float[Tensor, "t h w"] | None = None  # values of the moving Gaussians, blended like colours
 
 
@@ -37,16 +37,16 @@ def render_scene(
 ) -> Rendering:
     """The scene at `frames` (int, [b]) through the b poses of `camera`; differentiable.
 
-    `extra` is a value per moving Gaussian to be rendered as well; overlays have one of 1. Runs on the scene's
+    `extra` is a value per moving Gaussian to be rendered as well; patches have one of 1. Runs on the scene's
     device; frames and camera may be on the host.
     """
-    if scene.overlay is None:
+    if scene.overlay is None and scene.short_lived is None:
         camera, frames = to_device((camera, frames), scene.device)
         return render_snapshot(_snapshot(scene, camera, frames, extra), camera, scene.near, backend)
-    gaussians = len(scene.static) + len(scene.moving)
     parts = [
-        render_patched(scene, camera.select([i]), frame, scene.overlay.patch(frame, gaussians), backend, extra)
+        render_patched(scene, camera.select([i]), frame, patch, backend, extra)
         for i, frame in enumerate(frames.tolist())
+        if (patch := scene.patch(frame)) is not None
     ]
     names = [item.name for item in fields(Rendering) if getattr(parts[0], item.name) is not None]
     return Rendering(**{name: torch.cat([getattr(one, name) for one in parts]) for name in names})
@@ -98,7 +98,7 @@ def render_positions(
     """Where what is seen at one frame, through one pose, is at some times (m, in the world); and its opacity.
 
     Positions are blended like colours and divided by the opacity (Shape of Motion, Wang et al. 2024, section 3.3).
-    Differentiable; the scene's overlay has no motion, and is left out.
+    Differentiable; the scene's patches are left out.
     """
     camera, when = to_device((camera, torch.tensor([frame])), scene.device)
     snapshot = scene.at(when)

@@ -24,10 +24,12 @@ from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.gaussians import Gaussians
 from lerobot_msdyn.scene.overlay import Overlay
 from lerobot_msdyn.scene.shading import Shading
+from lerobot_msdyn.scene.short_lived import ShortLived
 
 FOLDER = Path("msdyn_scenes")  # inside an output dataset
 FOLDER_SCHEMA = 1  # of the folder of one camera
-SCENE_SCHEMA = 3  # of one scene's file
+SCENE_SCHEMA = 4  # of one scene's file
+_WITHOUT_SHORT_LIVED = 3  # of one that has none of them: what earlier versions read
 _SCENE_HEADER = "lerobot_msdyn"
 _HEADER, _CAMERA, _WINDOW = "scene.json", "camera.safetensors", "window_{:03d}.safetensors"
 
@@ -193,7 +195,7 @@ def list_scenes(folder: Path) -> dict[int, dict[str, Path]]:
 def save_scene(scene: DynamicScene, path: Path) -> None:
     """Write a scene as one safetensors file, atomically."""
     header = {
-        "schema": SCENE_SCHEMA,
+        "schema": _WITHOUT_SHORT_LIVED if scene.short_lived is None else SCENE_SCHEMA,
         "levels": [level.kind for level in scene.levels],
         "frames": scene.frames,
         "near": scene.near,
@@ -212,7 +214,7 @@ def load_scene(path: Path) -> DynamicScene:
         header = json.loads(metadata.get(_SCENE_HEADER, "{}"))
     except (OSError, ValueError, SafetensorError) as error:
         raise MsdynError(f"{path}: not a readable scene file ({error})") from error
-    if header.get("schema") != SCENE_SCHEMA:
+    if header.get("schema") not in (_WITHOUT_SHORT_LIVED, SCENE_SCHEMA):
         raise MsdynError(f"{path}: scene schema is {header.get('schema')}; expected {SCENE_SCHEMA}; fit it again")
     kinds = [_level_class(path, kind) for kind in header.get("levels", [])]
 
@@ -229,6 +231,7 @@ def load_scene(path: Path) -> DynamicScene:
             frames=header["frames"],
             shading=part("shading", Shading) if "shading.field" in tensors else None,
             near=header["near"],
+            short_lived=part("short_lived", ShortLived) if "short_lived.first" in tensors else None,
             overlay=part("overlay", Overlay) if "overlay.first" in tensors else None,
         )
     except KeyError as error:

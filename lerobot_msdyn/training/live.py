@@ -11,7 +11,7 @@ from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.motion.model.bases import MotionLevel, level_affines
 from lerobot_msdyn.render import rasterize
 from lerobot_msdyn.scene.dynamic import DynamicScene
-from lerobot_msdyn.scene.overlay import PATCH_OPACITY, Overlay
+from lerobot_msdyn.scene.overlay import PATCH_OPACITY, FramePatch
 from lerobot_msdyn.scene.store import SavedScene
 from lerobot_msdyn.training.posing import pose
 from lerobot_msdyn.views.coverage import HOLE_ALPHA
@@ -65,7 +65,8 @@ class _LiveWindow:
         static, moving = scene.static, scene.moving
         self._scene, self._static, self._own = scene, len(static), len(static) + len(moving)
         self._static_rgb = static.rgb
-        room = 0 if scene.overlay is None else int(scene.overlay.first.diff().max())
+        firsts = [part.first for part in (scene.short_lived, scene.overlay) if part is not None]
+        room = sum(int(first.diff().max()) for first in firsts)
         self._scales = torch.cat((static.scales, moving.scales, torch.zeros(room, 3)))
         self._opacities = torch.cat((static.opacity_logits, moving.opacity_logits)).sigmoid()
         self._means = torch.cat((static.means, moving.means, torch.zeros(room, 3)))
@@ -110,7 +111,7 @@ class _LiveWindow:
         if shading is not None:
             torch.mul(self._static_rgb, shading.static_gain(time)[0, :, None], out=self._rgb[: self._static])
             self._rgb[self._static : self._own] *= shading.moving_gain(time)[0, :, None]
-        count = self._own if self._scene.overlay is None else self._put_patch(self._scene.overlay, frame)
+        count = self._put_patch(self._scene.patch(frame))
         raster = rasterize(
             self._means[:count],
             self._quats[:count],
@@ -127,18 +128,18 @@ class _LiveWindow:
         rgb = planes.clamp(0, 1).mul_(255).round_().to(torch.uint8)
         return rgb.numpy(), raster.depth[0].numpy(), raster.alpha[0].numpy()
 
-    def _put_patch(self, overlay: Overlay, frame: int) -> int:
+    def _put_patch(self, patch: FramePatch | None) -> int:
         """Write a frame's patch behind the scene's own Gaussians, and hide those that it replaces; how many there are.
 
         What is hidden gets no opacity, which is faster than taking it out.
         """
-        rows = slice(int(overlay.first[frame]), int(overlay.first[frame + 1]))
-        place = slice(self._own, self._own + rows.stop - rows.start)
-        for buffer, values in ((self._means, overlay.means), (self._quats, overlay.quats), (self._rgb, overlay.rgb)):
-            buffer[place] = values[rows]
-        torch.exp(overlay.log_scales[rows].float(), out=self._scales[place])
-        shown = np.unpackbits(overlay.hidden[frame].numpy(), count=self._own) == 0
-        np.multiply(self._opacities.numpy(), shown, out=self._shown[: self._own].numpy())
+        if patch is None:
+            return self._own
+        place = slice(self._own, self._own + len(patch))
+        for buffer, values in ((self._means, patch.means), (self._quats, patch.quats), (self._rgb, patch.rgb)):
+            buffer[place] = values
+        torch.exp(patch.log_scales, out=self._scales[place])
+        torch.mul(self._opacities, ~patch.hidden, out=self._shown[: self._own])
         return place.stop
 
     def _set_moving(self, time: Int[Tensor, " 1"], eye: Tensor) -> None:

@@ -56,7 +56,8 @@ class Scores:
     moving_db: float  # the same over what moves: low where motion is not understood, however little of it there is
     moving_with_overlay_db: float  # the same with overlay, whose pixels are those of the recorded view itself
     by_motion: float  # share of this view's moving pixels that motion renders, 0..1; see scene/sources.py
-    by_overlay: float  # that an overlay renders; both 0 where nothing moves
+    by_short_lived: float  # that short-lived Gaussians render ...
+    by_overlay: float  # ... and an overlay; all 0 where nothing moves
     held_out: bool  # whether there were such frames
     unseen: float  # mean over the frames, 0..1
     angle_deg: float
@@ -112,9 +113,10 @@ def judge(windows: Sequence[FittedWindow], camera: CameraTrack) -> Scores:
         total.shares,
         decibels(float(torch.cat([check.fitted_error for check in checks]).mean())),
         float(np.mean([check.ssim for check in checks])),
-        decibels(account.error_without_overlay),
+        decibels(account.error_by_motion),
         decibels(account.error),
         moving.shares["by_motion"],
+        moving.shares["by_short_lived"],
         moving.shares["by_overlay"],
         all(check.held_out for check in checks),
         float(np.mean([frame.unseen for frame in frames])),

@@ -52,7 +52,9 @@ def test_scenes_of_another_dataset_are_refused(
     given = flags(desk, desk_scenes, tmp_path / "new")
     given[given.index("local/desk")] = "local/other"
     assert run(*given) == 2
-    assert f"--scenes {desk_scenes} holds scenes of local/desk; expected those of local/other" in capsys.readouterr().err
+    assert (
+        f"--scenes {desk_scenes} holds scenes of local/desk; expected those of local/other" in capsys.readouterr().err
+    )
     assert not (tmp_path / "new").exists()
 
 

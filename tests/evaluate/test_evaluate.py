@@ -81,7 +81,7 @@ def test_what_moves_is_scored_with_and_without_overlay(whole: Path, tmp_path: Pa
         assert scores["dyn_psnr_without_overlay"] == pytest.approx(alone["dyn_psnr"], abs=0.05)
         assert alone["dyn_psnr_without_overlay"] == alone["dyn_psnr"]
     assert shown["mean"]["dyn_psnr"] > shown["mean"]["dyn_psnr_without_overlay"] + 0.3
-    assert shown["what_moves"]["dynamic_db"] > shown["what_moves"]["dynamic_without_overlay_db"] + 3
+    assert shown["what_moves"]["dynamic_db"] > shown["what_moves"]["dynamic_by_motion_db"] + 3
     assert motion["what_moves"]["by_overlay"] == 0
 
 

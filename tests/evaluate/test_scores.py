@@ -66,7 +66,7 @@ def test_table_and_file(tmp_path: Path) -> None:
     table_of_sources = score_table({"az+05": shares}).splitlines()
     assert table_of_sources[0] == "| camera | dynamic PSNR | without overlay | by motion | by overlay |"
     assert table_of_sources[2] == "| az+05 | 21.00 | 17.00 | 23 % | 77 % |"
-    account = Account(MovingPixels(10, 90), 1e-3, 1e-2, held_out=True)
+    account = Account(MovingPixels(10, 0, 90), 1e-3, 1e-2, held_out=True)
     content = {
         "what_moves": account.entry(),
         "mean": {"psnr": math.inf, "ssim": 0.123456789},

@@ -10,9 +10,9 @@ from lerobot_msdyn.core.cameras import CameraTrack, intrinsics_from_fov, static_
 from lerobot_msdyn.core.observations import DepthTraits, View
 from lerobot_msdyn.motion.model.bases import identity_level
 from lerobot_msdyn.priors import PointTracks, Priors
-from lerobot_msdyn.reconstruction import make_overlay
 from lerobot_msdyn.reconstruction.background import background_gaussians, pixel_gaussians
-from lerobot_msdyn.reconstruction.make_overlay import unexplained
+from lerobot_msdyn.reconstruction.make_overlay import overlay_of
+from lerobot_msdyn.reconstruction.unexplained import wrong_pixels
 from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.rendering import Rendering, render_scene
 from lerobot_msdyn.scene.store import load_scene, save_scene
@@ -54,7 +54,7 @@ def red(scene: DynamicScene, camera: CameraTrack, frame: int) -> torch.Tensor:
 
 def test_the_recorded_camera_sees_what_it_recorded(recorded: tuple[DynamicScene, View, Priors]) -> None:
     scene, view, priors = recorded
-    mended = dataclasses.replace(scene, overlay=unexplained(scene, view, priors))
+    mended = dataclasses.replace(scene, overlay=overlay_of(scene, view, priors))
     for frame in range(FRAMES):
         expected = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
         expected[square(frame)] = True
@@ -64,7 +64,7 @@ def test_the_recorded_camera_sees_what_it_recorded(recorded: tuple[DynamicScene,
 
 def test_another_camera_sees_it_at_its_depth(recorded: tuple[DynamicScene, View, Priors]) -> None:
     scene, view, priors = recorded
-    mended = dataclasses.replace(scene, overlay=unexplained(scene, view, priors))
+    mended = dataclasses.replace(scene, overlay=overlay_of(scene, view, priors))
     elsewhere = dataclasses.replace(view.camera, world_from_camera=orbit_offset(8.0, 0.0, FAR).expand(FRAMES, 4, 4))
     found = red(mended, elsewhere, 3).nonzero().float().mean(0)
     here = red(mended, view.camera, 3).nonzero().float().mean(0)
@@ -82,7 +82,7 @@ def test_nothing_is_added_where_all_is_explained(recorded: tuple[DynamicScene, V
     wall = dataclasses.replace(view, rgb=view.rgb * 0 + 120)
     behind = dataclasses.replace(priors, depth=torch.full_like(priors.depth, FAR))
     without = DynamicScene(scene.static, scene.moving.select(slice(0, 0)), (), (), (), FRAMES)
-    overlay = unexplained(without, wall, behind)
+    overlay = overlay_of(without, wall, behind)
     assert len(overlay.means) == 0
     assert not overlay.hidden.any()
 
@@ -97,12 +97,12 @@ def test_depth_that_is_only_assumed_contradicts_nothing(
     wall = dataclasses.replace(view, rgb=view.rgb * 0 + 120)
     nearer = dataclasses.replace(priors, depth=torch.full_like(priors.depth, NEAR), depth_traits=traits)
     without = DynamicScene(scene.static, scene.moving.select(slice(0, 0)), (), (), (), FRAMES)
-    assert (len(unexplained(without, wall, nearer).means) > 0) is contradicts
+    assert (len(overlay_of(without, wall, nearer).means) > 0) is contradicts
 
 
 def test_what_motion_explains_is_left_to_it(recorded: tuple[DynamicScene, View, Priors]) -> None:
     scene, view, priors = recorded
-    overlay = unexplained(scene, view, priors)
+    overlay = overlay_of(scene, view, priors)
     own = len(scene.static) + len(scene.moving)
     right, wrong = (overlay.patch(frame, own) for frame in (0, 3))
     assert len(right) < 0.2 * len(wrong)
@@ -121,7 +121,7 @@ def test_the_same_is_unexplained_at_any_size() -> None:
         moving = torch.zeros(1, height, width)
         moving[0, 40 * unit : 80 * unit, 40 * unit : 120 * unit] = 1
         depth = torch.ones(1, height, width)
-        wrong = make_overlay._wrong(Rendering(rendered, depth, depth, moving), recorded, depth[0].numpy(), 0.02)
+        wrong = wrong_pixels(Rendering(rendered, depth, depth, moving), recorded, depth[0].numpy(), 0.02)
         shares.append((float(wrong[40 * unit : 80 * unit].mean()), float(wrong[86 * unit :].mean())))
     for first, second in shares[1:]:
         assert first == pytest.approx(shares[0][0], rel=0.2)  # windows are odd numbers of pixels
@@ -133,14 +133,14 @@ def test_what_has_one_colour_keeps_it(recorded: tuple[DynamicScene, View, Priors
     """Where a pixel is half covered, along the picture's border too: brighter ones would be a line from elsewhere."""
     scene, view, priors = recorded
     bright = dataclasses.replace(view, rgb=view.rgb * 0 + 230)
-    colours = unexplained(scene, bright, priors).rgb
+    colours = overlay_of(scene, bright, priors).rgb
     assert len(colours) > FRAMES * WIDTH
     torch.testing.assert_close(colours.float(), torch.full_like(colours, 230 / 255).float(), atol=0.02, rtol=0)
 
 
 def test_overlays_are_saved(recorded: tuple[DynamicScene, View, Priors], tmp_path: Path) -> None:
     scene, view, priors = recorded
-    mended = dataclasses.replace(scene, overlay=unexplained(scene, view, priors))
+    mended = dataclasses.replace(scene, overlay=overlay_of(scene, view, priors))
     save_scene(mended, tmp_path / "scene.safetensors")
     again, frames = load_scene(tmp_path / "scene.safetensors"), torch.arange(FRAMES)
     assert torch.equal(render_scene(again, view.camera, frames).rgb, render_scene(mended, view.camera, frames).rgb)

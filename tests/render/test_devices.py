@@ -21,7 +21,7 @@ from lerobot_msdyn.reconstruction.background import EmptyScene, background_gauss
 from lerobot_msdyn.reconstruction.evidence import evidence_of
 from lerobot_msdyn.reconstruction.fit import FitResult, fit
 from lerobot_msdyn.reconstruction.key_views import fixed_view
-from lerobot_msdyn.reconstruction.make_overlay import unexplained
+from lerobot_msdyn.reconstruction.make_overlay import overlay_of
 from lerobot_msdyn.reconstruction.result import FittedWindow, Reconstruction
 from lerobot_msdyn.reconstruction.self_check import self_check
 from lerobot_msdyn.scene import rendering
@@ -105,7 +105,7 @@ def test_what_is_made_of_a_fit(gpu: FakeGpu) -> None:
         result = fitted(view, priors)
         seen = evidence_of(result.scene, view.camera, fixed_view(empty, view.camera))
         check = self_check(result.scene, view, priors, result.held_out)
-        overlay = unexplained(result.scene, view, priors)
+        overlay = overlay_of(result.scene, view, priors)
         result = replace(result, scene=replace(result.scene, overlay=overlay))
         host = to_device((result.scene, seen), "cpu")
         window = FittedWindow(0, *host, check, STEPS, 0.0, {})

@@ -63,7 +63,7 @@ def test_a_turned_gaussian_looks_as_the_renderer_shows_it() -> None:
 def test_frames_of_a_scene(desk_scenes: Path, tmp_path: Path) -> None:
     scene = saved.load(saved.list_scenes(desk_scenes)[0]["observation.images.front"])
     overlaid, frame = scene.windows[1], torch.tensor([1])
-    scene = replace(scene, windows=tuple(replace(window, overlay=None) for window in scene.windows))
+    scene = replace(scene, windows=tuple(window.without_patches() for window in scene.windows))
     paths = export_frames(scene, range(5, 8), tmp_path)
     assert [path.name for path in paths] == ["frame_000005.ply", "frame_000006.ply", "frame_000007.ply"]
     window, eye = scene.windows[1], torch.zeros(1, 3)
@@ -76,8 +76,8 @@ def test_frames_of_a_scene(desk_scenes: Path, tmp_path: Path) -> None:
     still = len(window.static)
     torch.testing.assert_close(shaded(found.sh, sight)[0, still:], expected.rgb[0, still:], atol=1e-3, rtol=0)
     torch.testing.assert_close(found.rgb[:still], expected.rgb[0, :still], atol=1e-5, rtol=0)
-    if overlaid.overlay is not None:
-        patch = overlaid.overlay.patch(1, len(found))
+    patch = overlaid.patch(1)
+    if patch is not None:
         shown = gaussians_at(overlaid, 1)
         torch.testing.assert_close(shown.means, patched(overlaid.at(frame), patch).means[0])
         torch.testing.assert_close(shown.rgb[-len(patch) :], patch.rgb)

@@ -211,5 +211,5 @@ def test_what_is_no_scene_is_named(tmp_path: Path) -> None:
     with pytest.raises(MsdynError, match="not a readable scene file"):
         load_scene(path)
     save_file({"a": torch.zeros(1)}, path, metadata={"lerobot_msdyn": '{"schema": 99}'})
-    with pytest.raises(MsdynError, match="scene schema is 99; expected 3"):
+    with pytest.raises(MsdynError, match="scene schema is 99; expected 4"):
         load_scene(path)

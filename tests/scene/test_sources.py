@@ -91,4 +91,4 @@ def test_a_new_view_has_moving_pixels_without_a_mask_of_its_own(scene: DynamicSc
 
 
 def test_nothing_moves() -> None:
-    assert MovingPixels().shares == {"by_motion": 0, "by_overlay": 0, "by_background": 0}
+    assert MovingPixels().shares == {"by_motion": 0, "by_short_lived": 0, "by_overlay": 0, "by_background": 0}

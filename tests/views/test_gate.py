@@ -74,17 +74,19 @@ def test_what_moves_is_accounted_for(scene: Reconstruction) -> None:
     assert account == check.account
     assert account.pixels.total == int(check.moving.sum()) > 100
     assert account.held_out
-    assert account.error < account.error_without_overlay == check.moving_error
-    assert account.pixels.shares["by_overlay"] > 0.5, "so small a video is hardly explained by motion"
-    alone = scene.without_overlay()
+    assert account.error < account.error_by_motion == check.moving_error
+    shares = account.pixels.shares
+    assert shares["by_overlay"] + shares["by_short_lived"] > 0.5, "so small a video is hardly explained by motion"
+    alone = scene.by_motion_alone()
     assert alone.windows[0].scene.overlay is None
     assert window.scene.overlay is not None
     here, there, without = score(scene, 0), score(scene, 8), score(alone, 8)
-    assert here.by_overlay == pytest.approx(account.pixels.shares["by_overlay"], abs=0.1)
-    assert there.by_motion + there.by_overlay == pytest.approx(1, abs=0.01)
-    assert there.by_overlay > 0.5
-    assert (without.by_motion, without.by_overlay) == (1, 0)
-    assert there.moving_db == pytest.approx(account.dynamic_without_overlay_db)
+    assert here.by_overlay == pytest.approx(shares["by_overlay"], abs=0.1)
+    assert here.by_short_lived == pytest.approx(shares["by_short_lived"], abs=0.1)
+    assert there.by_motion + there.by_short_lived + there.by_overlay == pytest.approx(1, abs=0.02)
+    assert there.by_short_lived + there.by_overlay > 0.5
+    assert (without.by_motion, without.by_short_lived, without.by_overlay) == (1, 0, 0)
+    assert there.moving_db == pytest.approx(account.dynamic_by_motion_db)
     assert there.moving_with_overlay_db == pytest.approx(account.dynamic_db)
 
 
