@@ -162,13 +162,14 @@ def _short_lived(draft: Draft) -> None:
     reach = draft.recipe.scene.short_lived
     if reach > 0:
         short_lived = short_lived_of(draft.scene, draft.view, draft.priors, reach)
-        draft.scene = replace(draft.scene, short_lived=short_lived)
+        draft.scene = replace(draft.scene, short_lived=to_device(short_lived, draft.scene.device))
 
 
 def _overlay(draft: Draft) -> None:
     """Recorded pixels of single frames that the scene does not explain."""
     if draft.recipe.scene.overlay:
-        draft.scene = replace(draft.scene, overlay=overlay_of(draft.scene, draft.view, draft.priors))
+        overlay = overlay_of(draft.scene, draft.view, draft.priors)
+        draft.scene = replace(draft.scene, overlay=to_device(overlay, draft.scene.device))
 
 
 def _self_check(draft: Draft) -> None:

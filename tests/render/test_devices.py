@@ -22,6 +22,7 @@ from lerobot_msdyn.reconstruction.evidence import evidence_of
 from lerobot_msdyn.reconstruction.fit import FitResult, fit
 from lerobot_msdyn.reconstruction.key_views import fixed_view
 from lerobot_msdyn.reconstruction.make_overlay import overlay_of
+from lerobot_msdyn.reconstruction.make_short_lived import short_lived_of
 from lerobot_msdyn.reconstruction.result import FittedWindow, Reconstruction
 from lerobot_msdyn.reconstruction.self_check import self_check
 from lerobot_msdyn.scene import rendering
@@ -105,8 +106,10 @@ def test_what_is_made_of_a_fit(gpu: FakeGpu) -> None:
         result = fitted(view, priors)
         seen = evidence_of(result.scene, view.camera, fixed_view(empty, view.camera))
         check = self_check(result.scene, view, priors, result.held_out)
-        overlay = overlay_of(result.scene, view, priors)
-        result = replace(result, scene=replace(result.scene, overlay=overlay))
+        short = to_device(short_lived_of(result.scene, view, priors, 2), GPU)
+        scene_of_both = replace(result.scene, short_lived=short)
+        overlay = to_device(overlay_of(scene_of_both, view, priors), GPU)
+        result = replace(result, scene=replace(scene_of_both, overlay=overlay))
         host = to_device((result.scene, seen), "cpu")
         window = FittedWindow(0, *host, check, STEPS, 0.0, {})
         stands = Stands((Stand(0, len(view), 0.0),))
@@ -123,7 +126,9 @@ def test_what_is_made_of_a_fit(gpu: FakeGpu) -> None:
     assert len(pictures) == len(filled) == len(shares) == FRAMES
     assert np.isfinite(scores.expected_db)
     waits.pop("scene/overlay.py _first")
-    assert waits == {"scene/dynamic.py patched": FRAMES, "motion/model/bases.py _moves": 1}
+    waits.pop("scene/short_lived.py _first")
+    patches = {"scene/dynamic.py patched": FRAMES, "scene/dynamic.py patch": FRAMES}
+    assert waits == patches | {"motion/model/bases.py _moves": 1}
     batches = -(-FRAMES // BATCH)
     assert copies == {"core/serialise.py to_device": 3 * FRAMES + 2 * batches}  # coverage; pictures and depth
 
