@@ -14,8 +14,9 @@ from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.config import GateConfig
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.reconstruction.account import decibels, pooled
+from lerobot_msdyn.reconstruction.fast_camera import sharpness
 from lerobot_msdyn.reconstruction.result import FittedWindow
-from lerobot_msdyn.reconstruction.self_check import flicker, sharpness, stands_still
+from lerobot_msdyn.reconstruction.self_check import flicker, stands_still
 from lerobot_msdyn.scene.rendering import Rendering, render_scene
 from lerobot_msdyn.scene.sources import MovingPixels, moving_pixels_of_view
 from lerobot_msdyn.views.coverage import Coverage, angles_of, coverage_of
@@ -65,6 +66,8 @@ class Scores:
     sharpness_ratio: float
     frames: list[FrameScores]
     heat: list[list[int]]  # percent of the judged frames in which a part of the picture is uncovered
+    skew_px: float = 0.0  # of 320: by how much a rolling shutter bends the video's fast frames
+    fast_sharpness: float = 1.0  # of these, relative to the slow ones
 
 
 @torch.no_grad()
@@ -124,6 +127,8 @@ def judge(windows: Sequence[FittedWindow], camera: CameraTrack) -> Scores:
         sharpness_ratio(sharp),
         frames,
         _heat(np.mean(uncovered, axis=0)),
+        max(check.skew_px for check in checks),
+        min(check.fast_sharpness for check in checks),
     )
 
 
@@ -150,6 +155,7 @@ def reasons(scores: Scores, config: GateConfig) -> list[str]:
     for value, limit, name, text in (
         (scores.track_px, config.max_track_px, "max_track_px", "px from the tracks to the motion"),
         (scores.flicker_ratio, config.max_flicker_ratio, "max_flicker_ratio", "times the video's own flicker"),
+        (scores.skew_px, config.max_skew_px, "max_skew_px", "px (of 320) by which a rolling shutter bends fast frames"),
     ):
         if value > limit:
             why.append(f"{value:.1f} {text}, over gate.{name} {limit:g}")
@@ -157,6 +163,11 @@ def reasons(scores: Scores, config: GateConfig) -> list[str]:
         why.append(
             f"{scores.sharpness_ratio:.2f} of the video's sharpness, under gate.min_sharpness_ratio "
             f"{config.min_sharpness_ratio:g}"
+        )
+    if scores.fast_sharpness < config.min_fast_sharpness:
+        why.append(
+            f"{scores.fast_sharpness:.2f} of its slow frames' sharpness in frames in which the camera goes fast, under "
+            f"gate.min_fast_sharpness {config.min_fast_sharpness:g}: they are blurred"
         )
     return why
 

@@ -104,7 +104,7 @@ def test_what_is_made_of_a_fit(gpu: FakeGpu) -> None:
     with gpu:
         result = fitted(view, priors)
         seen = evidence_of(result.scene, view.camera, fixed_view(empty, view.camera))
-        check = self_check(result.scene, view, priors, result.held_out)
+        check = self_check(result.scene, view, priors, result.held_out, 1.0)
         overlay = unexplained(result.scene, view, priors)
         result = replace(result, scene=replace(result.scene, overlay=overlay))
         host = to_device((result.scene, seen), "cpu")

@@ -10,12 +10,12 @@ from lerobot_msdyn.core.config import GateConfig, Recipe
 from lerobot_msdyn.core.observations import DepthTraits, View
 from lerobot_msdyn.priors import PointTracks, Priors
 from lerobot_msdyn.reconstruction.account import decibels
+from lerobot_msdyn.reconstruction.fast_camera import sharpness
 from lerobot_msdyn.reconstruction.reconstruct import reconstruct
 from lerobot_msdyn.reconstruction.result import Reconstruction
 from lerobot_msdyn.reconstruction.self_check import (
     SelfCheck,
     flicker,
-    sharpness,
     similarity,
     stands_still,
     unsteadiness,
@@ -195,6 +195,16 @@ def test_the_verdict_says_why(scene: Reconstruction) -> None:
         (reason,) = reasons(scores, config)
         assert word in reason
         assert "\n" not in reason
+
+
+def test_a_camera_that_goes_too_fast_is_told(scene: Reconstruction) -> None:
+    scores = score(scene, 10)
+    assert (scores.skew_px, scores.fast_sharpness) == (0, 1), "this camera stands still"
+    fast = dataclasses.replace(scores, skew_px=13.0, fast_sharpness=0.05)
+    bent, blurred = reasons(fast, GateConfig())
+    assert "13.0 px (of 320)" in bent
+    assert "gate.max_skew_px 12" in bent
+    assert "gate.min_fast_sharpness 0.1" in blurred
 
 
 def test_the_record_holds_plain_values(scene: Reconstruction) -> None:
