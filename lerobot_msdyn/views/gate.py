@@ -155,7 +155,6 @@ def reasons(scores: Scores, config: GateConfig) -> list[str]:
     for value, limit, name, text in (
         (scores.track_px, config.max_track_px, "max_track_px", "px from the tracks to the motion"),
         (scores.flicker_ratio, config.max_flicker_ratio, "max_flicker_ratio", "times the video's own flicker"),
-        (scores.skew_px, config.max_skew_px, "max_skew_px", "px (of 320) by which a rolling shutter bends fast frames"),
     ):
         if value > limit:
             why.append(f"{value:.1f} {text}, over gate.{name} {limit:g}")
@@ -164,10 +163,23 @@ def reasons(scores: Scores, config: GateConfig) -> list[str]:
             f"{scores.sharpness_ratio:.2f} of the video's sharpness, under gate.min_sharpness_ratio "
             f"{config.min_sharpness_ratio:g}"
         )
-    if scores.fast_sharpness < config.min_fast_sharpness:
+    return why
+
+
+def video_reasons(windows: Sequence[FittedWindow], config: GateConfig) -> list[str]:
+    """Why no view of a video is kept, in words: its camera goes too fast for it; empty if some may be."""
+    why = []
+    skew_px = max(window.self_check.skew_px for window in windows)
+    sharp = min(window.self_check.fast_sharpness for window in windows)
+    if skew_px > config.max_skew_px:
         why.append(
-            f"{scores.fast_sharpness:.2f} of its slow frames' sharpness in frames in which the camera goes fast, under "
-            f"gate.min_fast_sharpness {config.min_fast_sharpness:g}: they are blurred"
+            f"the camera goes so fast that a rolling shutter bends pictures by {skew_px:.1f} px (of 320), over "
+            f"gate.max_skew_px {config.max_skew_px:g}; raise it if the shutter is global"
+        )
+    if sharp < config.min_fast_sharpness:
+        why.append(
+            f"the camera blurs pictures as it goes fast: {sharp:.2f} of the sharpness of slow ones, under "
+            f"gate.min_fast_sharpness {config.min_fast_sharpness:g}"
         )
     return why
 

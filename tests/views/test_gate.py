@@ -22,7 +22,7 @@ from lerobot_msdyn.reconstruction.self_check import (
 )
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.views.expected_error import expected_error
-from lerobot_msdyn.views.gate import MAX_RATIO, Scores, judge, ratio, reasons, record, sharpness_ratio
+from lerobot_msdyn.views.gate import MAX_RATIO, Scores, judge, ratio, reasons, record, sharpness_ratio, video_reasons
 from lerobot_msdyn.views.offsets import orbit_offset
 
 FRAMES, WIDTH, HEIGHT = 30, 64, 48
@@ -200,11 +200,12 @@ def test_the_verdict_says_why(scene: Reconstruction) -> None:
 def test_a_camera_that_goes_too_fast_is_told(scene: Reconstruction) -> None:
     scores = score(scene, 10)
     assert (scores.skew_px, scores.fast_sharpness) == (0, 1), "this camera stands still"
-    fast = dataclasses.replace(scores, skew_px=13.0, fast_sharpness=0.05)
-    bent, blurred = reasons(fast, GateConfig())
-    assert "13.0 px (of 320)" in bent
-    assert "gate.max_skew_px 12" in bent
-    assert "gate.min_fast_sharpness 0.1" in blurred
+    assert video_reasons(scene.windows, GateConfig()) == []
+    (window,) = scene.windows
+    fast = dataclasses.replace(window.self_check, skew_px=13.0, fast_sharpness=0.05)
+    bent, blurred = video_reasons([dataclasses.replace(window, self_check=fast)], GateConfig())
+    assert "by 13.0 px (of 320), over gate.max_skew_px 12" in bent
+    assert "0.05 of the sharpness of slow ones, under gate.min_fast_sharpness 0.1" in blurred
 
 
 def test_the_record_holds_plain_values(scene: Reconstruction) -> None:
