@@ -346,8 +346,8 @@ class GateConfig:
     max_flash_ratio: float = between(1.5, 0, INFINITY)
     # Smallest sharpness (variance of the Laplacian), relative to the video's.
     min_sharpness_ratio: float = between(0.1, 0, INFINITY)
-    # Of a camera that moves: how far a rolling shutter that reads a picture in half of the time between two may bend fast
-    # frames, in pixels of pictures 320 wide; to be raised for a global shutter.
+    # Of a camera that moves: by how many pixels (of 320) a rolling shutter may bend fast frames; it is taken to read a
+    # picture in half of the time between two. To be raised for a global shutter.
     max_skew_px: float = between(12.0, 0, INFINITY)
     # Of a camera that moves: smallest sharpness of its fast frames, relative to its slow ones: motion blur.
     min_fast_sharpness: float = between(0.1, 0, INFINITY)
