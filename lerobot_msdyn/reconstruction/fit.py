@@ -116,9 +116,12 @@ def fit(
             scene = parameters.scene
         drawn = next(order)
         frames = drawn.to(scene.device)
-        if poses is not None:
-            targets = replace(targets, view=replace(targets.view, camera=poses.camera))
-        camera = targets.view.camera.select(frames)
+        through = targets.view.camera
+        if poses is not None:  # pictures alone draw at them: tracks are of what moves
+            through = poses.camera
+            known = replace(through, world_from_camera=through.world_from_camera.detach())
+            targets = replace(targets, view=replace(targets.view, camera=known))
+        camera = through.select(frames)
         where = None
         if focus is not None and step % config.whole_every > 0 and len(scene.moving) > 0:
             scene, where = focus(scene, int(drawn))
