@@ -32,7 +32,7 @@ from lerobot_msdyn.reconstruction.result import Reconstruction
 from lerobot_msdyn.render.devices import chosen_device
 from lerobot_msdyn.scene.store import SceneSource
 from lerobot_msdyn.views.flashes import Flash, Flashes, largest_flash, too_large
-from lerobot_msdyn.views.gate import judge, reasons, record
+from lerobot_msdyn.views.gate import judge, reasons, record, video_reasons
 from lerobot_msdyn.views.new_cameras import NewCameras, new_cameras
 from lerobot_msdyn.views.pictures import Picture, UnseenMasks, log_uncovered, new_pictures, on_device
 
@@ -168,12 +168,15 @@ def _accepted(
 ) -> tuple[NewCameras, dict[str, Any], str]:
     """The cameras of one new episode, sampled again where they are rejected, the gate's record, and why it is dropped.
 
-    Where a recorded camera moves, no other sample is better.
+    Where a recorded camera moves, or goes too fast, no other sample is better.
     """
     rejected: list[str] = []
     moving = [f"{key}: {scene.stands.reason()}" for key, scene in scenes.items() if scene.stands.moves]
     if not recipe.gate.enabled or recipe.allow_moving:
         moving = []
+    if recipe.gate.enabled:
+        for key, scene in scenes.items():
+            moving += [f"{key}: {reason}" for reason in video_reasons(scene.windows, recipe.gate)]
     for attempt in range(1 if moving else recipe.gate.redraws + 1):
         chosen = new_cameras(scenes, recipe, index, variant, attempt, other)
         views: dict[str, dict[str, Any]] = {

@@ -250,17 +250,23 @@ class LearningRates:
     basis_shifts: float = between(1e-4, 0, 1)
     # Logits of the weights by which Gaussians follow bases, likewise.
     motion_weights: float = between(1e-2, 0, 1)
+    # Turns of a moving camera's poses in radians, where they are learned.
+    pose_turns: float = between(3e-4, 0, 1)
+    # Shifts of these poses, in units of the scene's look-at distance, likewise.
+    pose_shifts: float = between(3e-4, 0, 1)
 
 
 @dataclass
 class LearnConfig:
-    """Which of the motion is learned with the Gaussians; without, it stays as it was estimated."""
+    """What is learned with the Gaussians beside them; without, it stays as it was estimated."""
 
     # Whether the bases of all levels are.
     bases: bool = False
     # Whether the weights by which Gaussians follow them are.
     weights: bool = False
-    # Share of the steps after which it begins.
+    # Whether the poses of a camera that moves are, a small turn and shift per frame, from the first step on.
+    poses: bool = True
+    # Share of the steps after which bases and weights begin.
     begin: float = between(0.3, 0, 1)
     # The better the tracks agree with a basis, the slower it is learned: at half the rate where they miss it by so many
     # pixels (median, of pictures 320 wide); 0: all bases at the full rate, also those that no track follows.
@@ -343,6 +349,11 @@ class GateConfig:
     max_flash_ratio: float = between(1.5, 0, INFINITY)
     # Smallest sharpness (variance of the Laplacian), relative to the video's.
     min_sharpness_ratio: float = between(0.1, 0, INFINITY)
+    # Of a camera that moves: by how many pixels (of 320) a rolling shutter may bend fast frames; it is taken to read a
+    # picture in half of the time between two. To be raised for a global shutter.
+    max_skew_px: float = between(12.0, 0, INFINITY)
+    # Of a camera that moves: smallest sharpness of its fast frames, relative to its slow ones: motion blur.
+    min_fast_sharpness: float = between(0.1, 0, INFINITY)
     # How often a view that is rejected, by the gate or by max_unseen, is drawn again before it is dropped.
     redraws: int = between(3, 0, 100)
 

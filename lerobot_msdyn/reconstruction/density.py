@@ -87,6 +87,7 @@ class Density:
         self._total, self._count = torch.zeros(2, len(scene.static) + len(scene.moving))
 
 
+@torch.no_grad()
 def image_gradients(
     means: Float[Tensor, "b g 3"], gradient: Float[Tensor, "b g 3"], camera: CameraTrack
 ) -> Float[Tensor, "b g"]:

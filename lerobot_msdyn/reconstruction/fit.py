@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
+from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.config import FitConfig
 from lerobot_msdyn.core.errors import EpisodeError
 from lerobot_msdyn.core.observations import View
@@ -21,6 +22,7 @@ from lerobot_msdyn.reconstruction.brightness import moving_gain, static_shading
 from lerobot_msdyn.reconstruction.density import Density
 from lerobot_msdyn.reconstruction.doubt import doubts
 from lerobot_msdyn.reconstruction.focus import Focus
+from lerobot_msdyn.reconstruction.learned_poses import LearnedPoses
 from lerobot_msdyn.reconstruction.loss_terms import FitStep, Targets, certain_pixels
 from lerobot_msdyn.reconstruction.parameters import Parameters
 from lerobot_msdyn.scene.dynamic import DynamicScene
@@ -46,6 +48,7 @@ class FitResult:
     steps: int  # how many were taken
     seconds: float
     held_out: Int[Tensor, " b"]  # frames that were not fitted
+    camera: CameraTrack  # the recorded one, on the host; with learned poses where they were learned
 
 
 def fit(
@@ -88,7 +91,11 @@ def fit(
     if config.sh_degree > 0:
         scene = replace(scene, moving=with_slope(scene.moving))
     doubt = doubts(to_device(scene, "cpu"), view.camera, priors, config.learn.sure_px) if config.learn.bases else ()
-    parameters = Parameters(scene, config, distance, doubt, learned)
+    order, held_out = _frames(len(view.rgb), config.held_out_frames, seed)
+    poses = None
+    if config.learn.poses and not view.camera.is_static:
+        poses = LearnedPoses(view.camera, held_out, config.learning_rates, distance, scene.device)
+    parameters = Parameters(scene, config, distance, doubt, [*learned, *(poses.groups if poses else [])])
     density = Density(config.density, parameters, config.steps, distance, seed)
     wanted = Focus.wanted(config, view, priors) and not learned
     focus = Focus(to_device(scene, "cpu"), view, priors, scene.device) if wanted else None
@@ -96,8 +103,7 @@ def fit(
     certain = certain_pixels(moves, scaled_window(MASK_BAND_PX, view.camera.width))
     targets = to_device(Targets(view, priors, moves, certain, distance), scene.device)
     terms = {name: (LOSSES.get(name), weight) for name, weight in config.weights.items() if weight > 0}
-    order, held_out = _frames(len(view.rgb), config.held_out_frames, seed)
-    enough = _Enough(targets.view, held_out, config.patience, backend)
+    enough = _Enough(held_out, config.patience, backend)
     random = torch.Generator().manual_seed(seed)
     history: list[dict[str, Tensor]] = []
     for step in range(config.steps):
@@ -105,11 +111,17 @@ def fit(
             parameters.begin_motion()
         scene = parameters.scene
         if step == int(config.moving_gain_from * config.steps) and len(scene.moving) > 0:
-            parameters.shade(_measured_shading(scene, view, priors, backend))
+            seen = view if poses is None else replace(view, camera=poses.result())
+            parameters.shade(_measured_shading(scene, seen, priors, backend))
             scene = parameters.scene
         drawn = next(order)
         frames = drawn.to(scene.device)
-        camera = targets.view.camera.select(frames)
+        through = targets.view.camera
+        if poses is not None:  # pictures alone draw at them: tracks are of what moves
+            through = poses.camera
+            known = replace(through, world_from_camera=through.world_from_camera.detach())
+            targets = replace(targets, view=replace(targets.view, camera=known))
+        camera = through.select(frames)
         where = None
         if focus is not None and step % config.whole_every > 0 and len(scene.moving) > 0:
             scene, where = focus(scene, int(drawn))
@@ -121,16 +133,20 @@ def fit(
         loss: Float[Tensor, ""] | None = None
         if values:
             loss = torch.stack([terms[name][1] * value for name, value in values.items()]).sum()
+            if poses is not None:
+                loss = loss + poses.loss()
             _check(loss, step, frames)
         parameters.step(loss)
         density.after(step + 1, snapshot, camera)
         history.append({name: value.detach() for name, value in values.items()})
         progress(1)
-        if enough(parameters.scene, step + 1):
+        if enough(parameters.scene, targets.view, step + 1):
             break
     if len(history) < config.steps:
         progress(config.steps - len(history))
-    return _result(parameters.result(), history, targets.view, held_out, backend, time.perf_counter() - start)
+    camera = view.camera if poses is None else poses.result()
+    seconds = time.perf_counter() - start
+    return _result(parameters.result(), history, replace(view, camera=camera), held_out, backend, seconds)
 
 
 @torch.no_grad()
@@ -145,14 +161,14 @@ def psnr(scene: DynamicScene, view: View, frames: Int[Tensor, " b"], backend: st
 class _Enough:
     """Whether held-out frames have stopped to improve."""
 
-    def __init__(self, view: View, held_out: Int[Tensor, " b"], patience: int, backend: str) -> None:
-        self.view, self.held_out, self.patience, self.backend = view, held_out, patience, backend
+    def __init__(self, held_out: Int[Tensor, " b"], patience: int, backend: str) -> None:
+        self.held_out, self.patience, self.backend = held_out, patience, backend
         self.best_db, self.best_step = 0.0, 0
 
-    def __call__(self, scene: DynamicScene, steps: int) -> bool:
+    def __call__(self, scene: DynamicScene, view: View, steps: int) -> bool:
         if len(self.held_out) == 0 or steps % CHECK_STEPS != 0:
             return False
-        now_db = psnr(scene, self.view, self.held_out, self.backend)
+        now_db = psnr(scene, view, self.held_out, self.backend)
         if now_db > self.best_db + GAIN_DB:
             self.best_db, self.best_step = now_db, steps
         return steps - self.best_step >= self.patience
@@ -202,7 +218,8 @@ def _result(
     last = history[-max(1, len(history) // 10) :]
     losses = {name: float(torch.stack([step[name] for step in last]).mean()) for name in (last[0] if last else {})}
     frames = evenly(len(view), SCORED_FRAMES)
-    result = FitResult(scene, losses, psnr(scene, view, frames, backend), len(history), seconds, held_out)
+    train_psnr_db = psnr(scene, to_device(view, scene.device), frames, backend)
+    result = FitResult(scene, losses, train_psnr_db, len(history), seconds, held_out, view.camera)
     logger.info(
         "fit: %d + %d Gaussians, %d steps in %.0f s, %.1f dB on the recorded camera",
         len(scene.static),

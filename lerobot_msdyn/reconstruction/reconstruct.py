@@ -144,6 +144,7 @@ def _fit(draft: Draft) -> None:
         progress=lambda done: draft.progress(done / config.steps),
     )
     draft.scene = draft.fitted.scene
+    draft.view = replace(draft.view, camera=draft.fitted.camera)
 
 
 def _prune(draft: Draft) -> None:
@@ -174,7 +175,8 @@ def _overlay(draft: Draft) -> None:
 
 def _self_check(draft: Draft) -> None:
     """How well the scene explains its own video."""
-    draft.self_check = self_check(draft.scene, draft.view, draft.priors, draft.fitted.held_out)
+    held_out = draft.fitted.held_out
+    draft.self_check = self_check(draft.scene, draft.view, draft.priors, held_out, draft.distance)
 
 
 def _antialias(draft: Draft) -> None:

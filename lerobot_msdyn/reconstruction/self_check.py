@@ -8,9 +8,7 @@ them is judged with it, and what the scene alone makes of frames that it never s
 import logging
 from dataclasses import dataclass
 
-import cv2
 import kornia
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
@@ -22,6 +20,7 @@ from lerobot_msdyn.core.sampling import evenly, scaled_px
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.reconstruction.account import Account, account_line
+from lerobot_msdyn.reconstruction.fast_camera import fast_sharpness, skew_px, speed_px
 from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.rendering import render_scene
 from lerobot_msdyn.scene.sources import Sources, sources_of
@@ -54,6 +53,8 @@ class SelfCheck:
     track_px: float  # median distance of the tracks to the motion's projection
     flicker: float  # mean absolute difference of what stands still to the next frame, 0..1
     depth_error: float  # relative: what the provider of depth is known for, or more where its depth is less steady
+    skew_px: float  # of 320: by how much a rolling shutter bends fast frames of a camera that moves
+    fast_sharpness: float  # of its fast frames, relative to its slow ones: low where they are blurred
 
     @property
     def moving_error(self) -> float:
@@ -62,10 +63,12 @@ class SelfCheck:
 
 
 @torch.no_grad()
-def self_check(scene: DynamicScene, view: View, priors: Priors, held_out: Int[Tensor, " n"]) -> SelfCheck:
+def self_check(
+    scene: DynamicScene, view: View, priors: Priors, held_out: Int[Tensor, " n"], distance: float
+) -> SelfCheck:
     """What a scene, with its overlay, says of frames that it was not fitted to; of others where `held_out` is empty.
 
-    It is on the host.
+    It is on the host. `distance` (m) is that to the look-at point.
     """
     total = len(view.rgb)
     frames = held_out if len(held_out) else evenly(total, CHECKED_FRAMES + 2)
@@ -84,6 +87,16 @@ def self_check(scene: DynamicScene, view: View, priors: Priors, held_out: Int[Te
     )
     logger.info("%s", account_line(account))
     _log_instances(sources, priors.instances[frames])
+    speed = speed_px(view.camera, distance)
+    skew, fast = skew_px(speed), fast_sharpness(view.rgb, speed)
+    if not view.camera.is_static:
+        logger.info(
+            "camera: goes by %.1f px (of 320) per frame, usually; a rolling shutter would bend fast frames by %.1f px, "
+            "whose sharpness is %.2f of the slow ones'",
+            float(speed.median()),
+            skew,
+            fast,
+        )
     following = (frames + 1).clamp(max=total - 1)
     still = stands_still(moving) & stands_still(priors.instances[following] > 0)
     return SelfCheck(
@@ -101,6 +114,8 @@ def self_check(scene: DynamicScene, view: View, priors: Priors, held_out: Int[Te
         _track_residual(scene, view.camera, priors),
         flicker(recorded, view.rgb[following].float() / 255, still),
         max(priors.depth_traits.relative_error, unsteadiness(priors) if view.camera.is_static else 0.0),
+        skew,
+        fast,
     )
 
 
@@ -150,12 +165,6 @@ def flicker(
 ) -> float:
     """Mean absolute difference of what stands still to the next frame; 0 where nothing does."""
     return float((pictures - following).abs().mean(-1)[still].mean()) if bool(still.any()) else 0.0
-
-
-def sharpness(pictures: Float[Tensor, "t h w 3"]) -> float:
-    """Mean variance of the Laplacian of the brightness (0..1)."""
-    grey = (255 * pictures.mean(-1)).numpy()
-    return float(np.mean([cv2.Laplacian(image, cv2.CV_32F).var() for image in grey])) / 255**2
 
 
 def _track_residual(scene: DynamicScene, camera: CameraTrack, priors: Priors) -> float:

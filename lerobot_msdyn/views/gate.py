@@ -14,8 +14,9 @@ from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.config import GateConfig
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.reconstruction.account import decibels, pooled
+from lerobot_msdyn.reconstruction.fast_camera import sharpness
 from lerobot_msdyn.reconstruction.result import FittedWindow
-from lerobot_msdyn.reconstruction.self_check import flicker, sharpness, stands_still
+from lerobot_msdyn.reconstruction.self_check import flicker, stands_still
 from lerobot_msdyn.scene.rendering import Rendering, render_scene
 from lerobot_msdyn.scene.sources import MovingPixels, moving_pixels_of_view
 from lerobot_msdyn.views.coverage import Coverage, angles_of, coverage_of
@@ -66,6 +67,8 @@ class Scores:
     sharpness_ratio: float
     frames: list[FrameScores]
     heat: list[list[int]]  # percent of the judged frames in which a part of the picture is uncovered
+    skew_px: float = 0.0  # of 320: by how much a rolling shutter bends the video's fast frames
+    fast_sharpness: float = 1.0  # of these, relative to the slow ones
 
 
 @torch.no_grad()
@@ -126,6 +129,8 @@ def judge(windows: Sequence[FittedWindow], camera: CameraTrack) -> Scores:
         sharpness_ratio(sharp),
         frames,
         _heat(np.mean(uncovered, axis=0)),
+        max(check.skew_px for check in checks),
+        min(check.fast_sharpness for check in checks),
     )
 
 
@@ -159,6 +164,24 @@ def reasons(scores: Scores, config: GateConfig) -> list[str]:
         why.append(
             f"{scores.sharpness_ratio:.2f} of the video's sharpness, under gate.min_sharpness_ratio "
             f"{config.min_sharpness_ratio:g}"
+        )
+    return why
+
+
+def video_reasons(windows: Sequence[FittedWindow], config: GateConfig) -> list[str]:
+    """Why no view of a video is kept, in words: its camera goes too fast for it; empty if some may be."""
+    why = []
+    skew_px = max(window.self_check.skew_px for window in windows)
+    sharp = min(window.self_check.fast_sharpness for window in windows)
+    if skew_px > config.max_skew_px:
+        why.append(
+            f"the camera goes so fast that a rolling shutter bends pictures by {skew_px:.1f} px (of 320), over "
+            f"gate.max_skew_px {config.max_skew_px:g}; raise it if the shutter is global"
+        )
+    if sharp < config.min_fast_sharpness:
+        why.append(
+            f"the camera blurs pictures as it goes fast: {sharp:.2f} of the sharpness of slow ones, under "
+            f"gate.min_fast_sharpness {config.min_fast_sharpness:g}"
         )
     return why
 

@@ -105,7 +105,7 @@ def test_what_is_made_of_a_fit(gpu: FakeGpu) -> None:
     with gpu:
         result = fitted(view, priors)
         seen = evidence_of(result.scene, view.camera, fixed_view(empty, view.camera))
-        check = self_check(result.scene, view, priors, result.held_out)
+        check = self_check(result.scene, view, priors, result.held_out, 1.0)
         short = to_device(short_lived_of(result.scene, view, priors, 2), GPU)
         scene_of_both = replace(result.scene, short_lived=short)
         overlay = to_device(overlay_of(scene_of_both, view, priors), GPU)

@@ -10,19 +10,19 @@ from lerobot_msdyn.core.config import GateConfig, Recipe
 from lerobot_msdyn.core.observations import DepthTraits, View
 from lerobot_msdyn.priors import PointTracks, Priors
 from lerobot_msdyn.reconstruction.account import decibels
+from lerobot_msdyn.reconstruction.fast_camera import sharpness
 from lerobot_msdyn.reconstruction.reconstruct import reconstruct
 from lerobot_msdyn.reconstruction.result import Reconstruction
 from lerobot_msdyn.reconstruction.self_check import (
     SelfCheck,
     flicker,
-    sharpness,
     similarity,
     stands_still,
     unsteadiness,
 )
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.views.expected_error import expected_error
-from lerobot_msdyn.views.gate import MAX_RATIO, Scores, judge, ratio, reasons, record, sharpness_ratio
+from lerobot_msdyn.views.gate import MAX_RATIO, Scores, judge, ratio, reasons, record, sharpness_ratio, video_reasons
 from lerobot_msdyn.views.offsets import orbit_offset
 
 FRAMES, WIDTH, HEIGHT = 30, 64, 48
@@ -197,6 +197,17 @@ def test_the_verdict_says_why(scene: Reconstruction) -> None:
         (reason,) = reasons(scores, config)
         assert word in reason
         assert "\n" not in reason
+
+
+def test_a_camera_that_goes_too_fast_is_told(scene: Reconstruction) -> None:
+    scores = score(scene, 10)
+    assert (scores.skew_px, scores.fast_sharpness) == (0, 1), "this camera stands still"
+    assert video_reasons(scene.windows, GateConfig()) == []
+    (window,) = scene.windows
+    fast = dataclasses.replace(window.self_check, skew_px=13.0, fast_sharpness=0.05)
+    bent, blurred = video_reasons([dataclasses.replace(window, self_check=fast)], GateConfig())
+    assert "by 13.0 px (of 320), over gate.max_skew_px 12" in bent
+    assert "0.05 of the sharpness of slow ones, under gate.min_fast_sharpness 0.1" in blurred
 
 
 def test_the_record_holds_plain_values(scene: Reconstruction) -> None:
