@@ -89,10 +89,10 @@ def augment(config: AugmentConfig, opened: "Opened", new_repo_id: str, new_root:
 
     start = time.perf_counter()
     if not config.convert:
-        staging.agree(describe_opened(config, opened.source, opened.episodes), restart=config.restart)
+        staging.agree(describe_opened(config, opened.source), restart=config.restart)
     output = checked_output(config, opened, new_repo_id, new_root, staging)
     with terse(config):
-        failures = run_local(opened.source, opened.episodes, opened.cameras, config, output)
+        failures = run_local(opened, config, output)
     done, left_out = deliver(config, opened, output, failures, lambda: time.perf_counter() - start)
     sys.stdout.write(done + "".join(f"{line}\n" for line in left_out))
     return EXIT_SOME_EPISODES_FAILED if left_out else EXIT_OK
@@ -101,7 +101,7 @@ def augment(config: AugmentConfig, opened: "Opened", new_repo_id: str, new_root:
 def _say_plan(config: AugmentConfig, opened: "Opened", new_root: Path) -> int:
     from lerobot_msdyn.augment.plan import plan
 
-    sys.stdout.write(plan(opened.source, opened.episodes, opened.cameras, config, new_root))
+    sys.stdout.write(plan(opened, config, new_root))
     return EXIT_OK
 
 
