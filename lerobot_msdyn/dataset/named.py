@@ -7,6 +7,7 @@ from pathlib import Path
 from huggingface_hub import HfApi, constants
 
 from lerobot_msdyn.core.errors import DatasetError
+from lerobot_msdyn.core.files import check_root
 
 HUB_TIMEOUT_S = 10
 INFO_PLACES = "*/*/meta/info.json"  # of the datasets in LeRobot's home
@@ -15,6 +16,18 @@ INFO_PLACES = "*/*/meta/info.json"  # of the datasets in LeRobot's home
 def lerobot_home() -> Path:
     """Where LeRobot keeps datasets: `lerobot.utils.constants.HF_LEROBOT_HOME`."""
     return Path(os.environ.get("HF_LEROBOT_HOME", Path(constants.HF_HOME) / "lerobot")).expanduser()
+
+
+def check_there(repo_id: str, root: Path | None) -> None:
+    """Whether there is a dataset in a folder or, without one, of a name: before slow imports.
+
+    Raises:
+        DatasetError: there is none.
+    """
+    if root is None:
+        check_named(repo_id)
+    else:
+        check_root(root)
 
 
 def check_named(repo_id: str) -> None:
