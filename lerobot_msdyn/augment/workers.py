@@ -26,7 +26,7 @@ from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.augment.episode import Progress
 from lerobot_msdyn.core.cli import quiet_libraries
 from lerobot_msdyn.core.plugins import import_plugins, imported_plugins
-from lerobot_msdyn.core.processes import Processes
+from lerobot_msdyn.core.processes import Processes, cores
 from lerobot_msdyn.dataset.read import open_source
 from lerobot_msdyn.dataset.staging import BACKGROUNDS, Staging
 from lerobot_msdyn.dataset.video import quiet_encoders
@@ -127,11 +127,6 @@ def threads_of_one(count: int) -> Iterator[None]:
 
 def _share_of_threads(count: int) -> int:
     return max(1, torch.get_num_threads() // count)
-
-
-def cores() -> int:
-    """Of this machine, that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _memory() -> int:

@@ -14,12 +14,13 @@ from lerobot_msdyn.augment.cost import (
     predicted_output_bytes,
 )
 from lerobot_msdyn.augment.job import Opened, chosen_episodes, place_of
-from lerobot_msdyn.augment.workers import cores, most_workers, terse, threads_of_one
+from lerobot_msdyn.augment.workers import most_workers, terse, threads_of_one
 from lerobot_msdyn.cluster.config import ClusterConfig, job_settings
 from lerobot_msdyn.cluster.shards import frames_to_render, shards
 from lerobot_msdyn.cluster.stages import finished_in
 from lerobot_msdyn.cluster.task import Job
 from lerobot_msdyn.core.plugins import imported_plugins
+from lerobot_msdyn.core.processes import cores
 from lerobot_msdyn.dataset.read import open_source
 
 SHOWN = 16  # tasks, each by a line
