@@ -4,7 +4,7 @@ import difflib
 import os
 from pathlib import Path
 
-from huggingface_hub import HfApi, constants
+from huggingface_hub import constants
 
 from lerobot_msdyn.core.errors import DatasetError
 from lerobot_msdyn.core.files import check_root
@@ -42,6 +42,8 @@ def check_named(repo_id: str) -> None:
     downloaded = home / "hub" / f"datasets--{repo_id.replace('/', '--')}"
     if (home / repo_id / "meta" / "info.json").exists() or downloaded.exists():
         return
+    from huggingface_hub import HfApi  # only now: its clients take as long to import as all of the help
+
     try:
         HfApi().dataset_info(repo_id, timeout=HUB_TIMEOUT_S)
     except Exception as error:  # several libraries take part, each with errors of its own
