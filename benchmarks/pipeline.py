@@ -43,6 +43,7 @@ MORE_STAGES = (REST, "copy")  # beside these, where a whole job is timed
 BASELINE = Path(__file__).with_suffix(".json")
 SLACK = 1.3  # a figure may grow by so many times what it grows by in the baseline
 LINEAR = 1.1  # power up to which growth counts as linear
+SHOWN = 0.05  # s of the base case, from which growth is shown
 LEAST_S = 0.5  # of processor time in the base case, from which a stage is judged
 
 
@@ -207,7 +208,7 @@ def run(case: Case, recipe: str, steps: int | None, data: Path | None) -> tuple[
 def growth(row: dict[str, float], base: dict[str, float], columns: tuple[str, ...]) -> str:
     """How many times the base case's each figure is."""
     return "".join(
-        f"{row[name] / base[name]:{max(9, len(name) + 2)}.2f}" if base[name] > 0 else " " * max(9, len(name) + 2)
+        f"{row[name] / base[name]:{max(9, len(name) + 2)}.2f}" if base[name] > SHOWN else " " * max(9, len(name) + 2)
         for name in columns
     )
 
