@@ -75,6 +75,7 @@ def chosen_episodes(source: LeRobotDatasetMetadata, config: AugmentConfig) -> tu
 
     Raises:
         DatasetError: one that is asked for is not there.
+        EpisodeError: none can be read.
     """
     episodes = select_episodes(source, config.episodes)
     if config.episodes_share == 1:

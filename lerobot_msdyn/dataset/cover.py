@@ -1,6 +1,6 @@
 """Some episodes of a dataset that cover what is recorded in all of them: every task, and the ways it was done."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float64
@@ -24,14 +24,19 @@ def covering_episodes(source: LeRobotDatasetMetadata, episodes: Sequence[int], s
         source: the dataset.
         episodes: those to choose from.
         share: above 0, at most 1, of the episodes.
+
+    Raises:
+        EpisodeError: none can be read; the first one's reason.
     """
     courses: dict[int, Float64[ndarray, " d"]] = {}
+    errors = []
     for index in episodes:
-        course = _course(source, index)
-        if course is not None:
-            courses[index] = course
+        try:
+            courses[index] = _course(source, index)
+        except EpisodeError as error:
+            errors.append(error)
     if not courses:
-        return []
+        raise errors[0]
     by_task: dict[tuple[str, ...], list[int]] = {}
     for index in courses:
         by_task.setdefault(tuple(source.episodes[index]["tasks"]), []).append(index)
@@ -67,17 +72,19 @@ def shared_out(count: int, sizes: Sequence[int]) -> list[int]:
     return given
 
 
-def _course(source: LeRobotDatasetMetadata, index: int) -> Float64[ndarray, " d"] | None:
-    """States and actions at a few moments of an episode, [MOMENTS * values]; nothing where they cannot be read."""
-    keys = [key for key in (OBS_STATE, ACTION) if key in source.features]
-    try:
-        columns: Mapping[str, ndarray] = read_columns(source, index, keys)
-    except EpisodeError:
-        return None
+def _course(source: LeRobotDatasetMetadata, index: int) -> Float64[ndarray, " d"]:
+    """States and actions at a few moments of an episode, [MOMENTS * values].
+
+    Raises:
+        EpisodeError: they cannot be read, or are no numbers.
+    """
+    columns = read_columns(source, index, [key for key in (OBS_STATE, ACTION) if key in source.features])
     values = np.concatenate([column.reshape(len(column), -1) for column in columns.values()], axis=1)
     moments = np.linspace(0, len(values) - 1, MOMENTS).round().astype(int)
     course = values[moments].astype(np.float64).ravel()
-    return course if np.isfinite(course).all() else None
+    if not np.isfinite(course).all():
+        raise EpisodeError(f"{source.repo_id} episode {index}: {' or '.join(columns)} is not a number in some rows")
+    return course
 
 
 def _scaled(courses: Float64[ndarray, "n d"]) -> Float64[ndarray, "n d"]:

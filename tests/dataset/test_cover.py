@@ -13,6 +13,7 @@ from lerobot.datasets import LeRobotDataset
 
 from lerobot_msdyn.augment import __main__ as augment
 from lerobot_msdyn.augment import run as episodes_of
+from lerobot_msdyn.core.errors import EpisodeError
 from lerobot_msdyn.dataset.cover import covering_episodes, farthest, shared_out
 from lerobot_msdyn.dataset.read import open_source
 from lerobot_msdyn.dataset.rows import read_columns, read_rows, values_of
@@ -84,6 +85,8 @@ def test_what_cannot_be_read_is_not_chosen(desk: Path, monkeypatch: pytest.Monke
     episodes[1] = episodes[1] | {"length": 7}
     monkeypatch.setattr(source, "episodes", episodes)
     assert covering_episodes(source, range(3), 1) == [0, 2]
+    with pytest.raises(EpisodeError, match=r"local/desk episode 1: .* has 12 rows; expected 7"):
+        covering_episodes(source, [1], 0.5)
 
 
 def test_columns_are_those_of_the_rows(desk: Path) -> None:
