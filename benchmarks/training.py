@@ -34,7 +34,13 @@ def prepare(folder: Path, episodes: int, frames: int, width: int, height: int, s
     """A dataset, and the same with new episodes and saved scenes."""
     scenes = [make_scene("push", 0, frames, width, height, episode=index) for index in range(episodes)]
     write_dataset(scenes, "local/desk", folder / "desk")
-    flags = {"variants": 1, "include_source": "false", "save_scenes": "true", "fit.steps": steps}
+    flags = {
+        "variants": 1,
+        "include_source": "false",
+        "save_scenes": "true",
+        "fit.steps": steps,
+        "gate.enabled": "false",
+    }
     command = [sys.executable, "-m", "lerobot_msdyn.augment", "--repo", "local/desk", "--root", str(folder / "desk")]
     subprocess.run([*command, *(f"--{name}={value}" for name, value in flags.items())], check=True)
 

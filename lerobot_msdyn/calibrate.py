@@ -16,6 +16,7 @@ from lerobot_msdyn.core.config import RobotConfig
 from lerobot_msdyn.core.errors import ConfigError, OutputError, PriorError
 from lerobot_msdyn.core.fields import between
 from lerobot_msdyn.core.files import write_whole
+from lerobot_msdyn.dataset.named import check_there
 
 logger = logging.getLogger(__name__)
 
@@ -54,6 +55,7 @@ def run(arguments: list[str]) -> int:
     config = parse_config(CalibrateConfig, arguments, ALIASES, command=COMMAND)
     if not config.repo_id:
         raise ConfigError(f"--repo is missing; expected: {COMMAND} --repo NAME [--root FOLDER] [--robot.name so101]")
+    check_there(config.repo_id, config.root)
     from lerobot_msdyn.augment.riding_cameras import riding_camera
     from lerobot_msdyn.augment.robot_cameras import NAME, robot_cameras, summary
     from lerobot_msdyn.dataset.read import open_source

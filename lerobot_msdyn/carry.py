@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from lerobot_msdyn.core.cli import EXIT_OK, parse_config, run_command
 from lerobot_msdyn.core.errors import ConfigError, DatasetError
+from lerobot_msdyn.core.files import check_root
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDatasetMetadata
@@ -93,6 +94,8 @@ def run(arguments: list[str]) -> int:
     config = parse_config(CarryConfig, arguments, {}, command=COMMAND)
     if config.root is None or not config.sources:
         raise ConfigError(f"which datasets? {COMMAND} --root FOLDER --sources '[FOLDER, ...]' (see --help)")
+    for root in (config.root, *config.sources):
+        check_root(root)
     count = carry_provenance(config.root, config.sources)
     sys.stdout.write(f"meta/msdyn/ of {count} episodes written to {config.root}\n")
     return EXIT_OK

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from lerobot_msdyn.core.cli import EXIT_OK, parse_config, run_command
 from lerobot_msdyn.core.errors import ConfigError, DatasetError
 from lerobot_msdyn.core.fields import between
+from lerobot_msdyn.core.files import check_root
 from lerobot_msdyn.dataset.named import lerobot_home
 
 if TYPE_CHECKING:
@@ -126,7 +127,9 @@ def run(arguments: list[str]) -> int:
     config = parse_config(SplitConfig, arguments, {"repo": "repo_id"}, command=COMMAND)
     if config.root is None and not config.repo_id:
         raise ConfigError(f"which dataset? {COMMAND} --repo NAME or --root FOLDER (see --help)")
-    split = split_by_source(config.root or lerobot_home() / config.repo_id, config.eval_split)
+    root = config.root or lerobot_home() / config.repo_id
+    check_root(root)
+    split = split_by_source(root, config.eval_split)
     logger.info("%d episodes to train on, %d to evaluate on", len(split.train), len(split.evaluation))
     sys.stdout.write(" ".join(split.arguments) + "\n")
     return EXIT_OK

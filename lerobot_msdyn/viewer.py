@@ -19,6 +19,7 @@ from lerobot_msdyn.core.cli import EXIT_OK, parse_config, run_command
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import ConfigError, DatasetError, MsdynError, OutputError
 from lerobot_msdyn.core.fields import MAX_INDEX, between
+from lerobot_msdyn.dataset.named import check_there
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -65,6 +66,7 @@ def run(arguments: list[str]) -> int:
     config = parse_config(ViewerConfig, arguments, ALIASES, command=COMMAND)
     if not config.repo_id:
         raise ConfigError(f"which dataset? {COMMAND} --repo NAME [--root FOLDER] (see --help)")
+    check_there(config.repo_id, config.root)
     try:
         import rerun as rr
     except ImportError as error:

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 from lerobot_msdyn.augment.config import ESSENTIALS, AugmentConfig
 from lerobot_msdyn.core.cli import EXIT_INTERRUPTED, EXIT_OK, EXIT_SOME_EPISODES_FAILED, parse_config, run_command
 from lerobot_msdyn.core.errors import ConfigError, MsdynError
-from lerobot_msdyn.core.files import check_root
-from lerobot_msdyn.dataset.named import check_named
+from lerobot_msdyn.dataset.named import check_there
 
 if TYPE_CHECKING:
     from lerobot_msdyn.augment.job import Opened
@@ -30,10 +29,7 @@ def run(arguments: list[str]) -> int:
     config = parse_config(AugmentConfig, arguments, ALIASES, command=COMMAND, essentials=ESSENTIALS)
     if not config.repo_id:
         raise ConfigError(f"which dataset? {COMMAND} --repo NAME [--root FOLDER] (see --help)")
-    if config.root is None:
-        check_named(config.repo_id)
-    else:
-        check_root(config.root)
+    check_there(config.repo_id, config.root)
     logger.info("opening %s", config.root or config.repo_id)
     # LeRobot and torch take seconds to import: only now, so that --help and bad flags are answered at once.
     from lerobot_msdyn.augment.job import finished_before, open_job, place_of
@@ -89,10 +85,10 @@ def augment(config: AugmentConfig, opened: "Opened", new_repo_id: str, new_root:
 
     start = time.perf_counter()
     if not config.convert:
-        staging.agree(describe_opened(config, opened.source, opened.episodes), restart=config.restart)
+        staging.agree(describe_opened(config, opened.source), restart=config.restart)
     output = checked_output(config, opened, new_repo_id, new_root, staging)
     with terse(config):
-        failures = run_local(opened.source, opened.episodes, opened.cameras, config, output)
+        failures = run_local(opened, config, output)
     done, left_out = deliver(config, opened, output, failures, lambda: time.perf_counter() - start)
     sys.stdout.write(done + "".join(f"{line}\n" for line in left_out))
     return EXIT_SOME_EPISODES_FAILED if left_out else EXIT_OK
@@ -101,7 +97,7 @@ def augment(config: AugmentConfig, opened: "Opened", new_repo_id: str, new_root:
 def _say_plan(config: AugmentConfig, opened: "Opened", new_root: Path) -> int:
     from lerobot_msdyn.augment.plan import plan
 
-    sys.stdout.write(plan(opened.source, opened.episodes, opened.cameras, config, new_root))
+    sys.stdout.write(plan(opened, config, new_root))
     return EXIT_OK
 
 

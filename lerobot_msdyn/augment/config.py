@@ -22,6 +22,8 @@ class AugmentConfig(Recipe):
     new_root: Path | None = None
     # Source episodes to use, e.g. 0, 0,3 or 0-9; default: all.
     episodes: list[int] | None = None
+    # Share of the episodes that get new ones; these are chosen to cover all tasks and the ways they were done.
+    episodes_share: float = between(1.0, 0.001, 1.0)
     # How far (s) a video frame may be from its row's time, as LeRobot's tolerance_s; irrelevant where a video has
     # as many frames as its episode has rows, which are then matched by number.
     tolerance_s: float = between(1e-4, 0.0, 1.0)
@@ -40,7 +42,18 @@ class AugmentConfig(Recipe):
 
 
 ESSENTIALS = Essentials(
-    fields=("repo_id", "root", "new_repo_id", "episodes", "cameras", "variants", "fetch_models", "dry_run", "workers"),
+    fields=(
+        "repo_id",
+        "root",
+        "new_repo_id",
+        "episodes",
+        "cameras",
+        "variants",
+        "episodes_share",
+        "fetch_models",
+        "dry_run",
+        "workers",
+    ),
     examples=(
         "--repo local/ds",
         "--repo local/ds --episodes 0-2 --recipe quick",

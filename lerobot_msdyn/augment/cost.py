@@ -147,19 +147,30 @@ def _timed_fit(
     return scene, prepare_s, statistics.fmean(steps)
 
 
-def predicted_output_bytes(source: LeRobotDatasetMetadata, episodes: list[int], recipe: Recipe) -> float:
-    """Disk for the new dataset without saved scenes: each of its frames takes what one of the source takes."""
-    share = frames_of(source, episodes) / max(source.total_frames, 1)
-    return _size_of(source, "data", "videos") * share * (recipe.variants + int(recipe.include_source))
+def predicted_output_bytes(
+    source: LeRobotDatasetMetadata, episodes: Sequence[int], rendered: Sequence[int], recipe: Recipe
+) -> float:
+    """Disk for the new dataset without saved scenes: each of its frames takes what one of the source takes.
+
+    Args:
+        source: the dataset.
+        episodes: those that are used.
+        rendered: those of them that get new ones.
+        recipe: the settings.
+    """
+    frames = frames_of(source, rendered) * recipe.variants + frames_of(source, episodes) * int(recipe.include_source)
+    return _size_of(source, "data", "videos") * frames / max(source.total_frames, 1)
 
 
-def predicted_bytes(speeds: Speeds, source: LeRobotDatasetMetadata, episodes: list[int], recipe: Recipe) -> float:
+def predicted_bytes(
+    speeds: Speeds, source: LeRobotDatasetMetadata, episodes: list[int], rendered: list[int], recipe: Recipe
+) -> float:
     """Disk for the new dataset without saved scenes, its new videos as a few of their frames were encoded."""
-    frames = frames_of(source, episodes)
-    copied = predicted_output_bytes(source, episodes, recipe)
+    frames = frames_of(source, rendered)
+    copied = predicted_output_bytes(source, episodes, rendered, recipe)
     share = frames / max(source.total_frames, 1)
     recorded = _size_of(source, *(f"videos/{key}" for key in speeds.videos)) * share
-    views = len(episodes) * recipe.variants * len(speeds.videos)
+    views = len(rendered) * recipe.variants * len(speeds.videos)
     report = REPORT_BYTES * min(views, PICTURED)
     return copied + recipe.variants * (frames * speeds.video_bytes - recorded) + report
 
@@ -175,19 +186,22 @@ def _size_of(source: LeRobotDatasetMetadata, *folders: str) -> int:
     return sum(file.stat().st_size for file in files)
 
 
-def check_disk(source: LeRobotDatasetMetadata, episodes: list[int], recipe: Recipe, folder: Path) -> None:
+def check_disk(
+    source: LeRobotDatasetMetadata, episodes: list[int], rendered: list[int], recipe: Recipe, folder: Path
+) -> None:
     """Whether a run has the disk that it will take: the output, and as much again while it is made.
 
     Args:
         source: the dataset.
         episodes: those that are used.
+        rendered: those of them that get new ones.
         recipe: the settings.
         folder: the work folder; what an unfinished run has left in it counts as written.
 
     Raises:
         OutputError: not even the output fits.
     """
-    output = predicted_output_bytes(source, episodes, recipe)
+    output = predicted_output_bytes(source, episodes, rendered, recipe)
     there = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     free = shutil.disk_usage(folder).free
     if free + there < output:

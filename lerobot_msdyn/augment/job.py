@@ -3,6 +3,7 @@
 `run` works on the episodes. One process does all of it (`__main__`), or many do (the stage `cluster`).
 """
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from lerobot.utils.constants import HF_LEROBOT_HOME
 from lerobot_msdyn.augment.backgrounds import background_episodes
 from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.augment.cost import check_disk
-from lerobot_msdyn.augment.failures import one_line_each
+from lerobot_msdyn.augment.failures import one_line_each, ranges
 from lerobot_msdyn.augment.moving_cameras import cameras_off_the_gripper, still_cameras
 from lerobot_msdyn.augment.report.build import entries_of, write_report
 from lerobot_msdyn.augment.report.page import accounts_of
@@ -22,6 +23,7 @@ from lerobot_msdyn.augment.robot_cameras import calibration_episodes, publish
 from lerobot_msdyn.augment.run_identity import all_files, describe_run, recipe_text, source_files
 from lerobot_msdyn.augment.workers import terse
 from lerobot_msdyn.core.errors import DatasetError, EpisodeError
+from lerobot_msdyn.dataset.cover import covering_episodes
 from lerobot_msdyn.dataset.provenance import CALIBRATION, FOLDER, SOURCE_VARIANT, read_provenance
 from lerobot_msdyn.dataset.read import open_source
 from lerobot_msdyn.dataset.select import lost_episodes, select_cameras, select_episodes
@@ -31,6 +33,8 @@ from lerobot_msdyn.dataset.write import MadeEpisodes, OutputDataset, check_name
 from lerobot_msdyn.reconstruction.account import account_line
 from lerobot_msdyn.views.camera_change import units_of_shifts
 
+logger = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class Opened:
@@ -38,6 +42,7 @@ class Opened:
 
     source: LeRobotDatasetMetadata
     episodes: list[int]
+    rendered: list[int]  # those of them that get new episodes
     cameras: list[str]  # that are re-rendered
 
 
@@ -55,7 +60,28 @@ def open_job(config: AugmentConfig, root: Path | None) -> Opened:
             cameras = cameras_off_the_gripper(source, cameras, config)
         else:
             cameras = still_cameras(source, episodes, cameras, config)
-    return Opened(source, episodes, cameras)
+    episodes, rendered = chosen_episodes(source, config)
+    if config.episodes_share < 1:
+        logger.info(
+            "new episodes of %d, chosen to cover what was recorded (--episodes_share): %s",
+            len(rendered),
+            ranges(rendered),
+        )
+    return Opened(source, episodes, rendered, cameras)
+
+
+def chosen_episodes(source: LeRobotDatasetMetadata, config: AugmentConfig) -> tuple[list[int], list[int]]:
+    """The episodes that are worked on, and those of them that get new ones; the others are written as recorded.
+
+    Raises:
+        DatasetError: one that is asked for is not there.
+        EpisodeError: none can be read.
+    """
+    episodes = select_episodes(source, config.episodes)
+    if config.episodes_share == 1:
+        return episodes, episodes
+    rendered = covering_episodes(source, episodes, config.episodes_share)
+    return (episodes if config.include_source else rendered), rendered
 
 
 def place_of(config: AugmentConfig) -> tuple[str, Path]:
@@ -94,13 +120,13 @@ def describe(config: AugmentConfig, root: Path) -> dict[str, Any]:
     """What the result of the job depends on."""
     if config.convert:
         return describe_run(root, all_files(root), config)
-    source = open_source(config.repo_id, config.root)
-    return describe_opened(config, source, select_episodes(source, config.episodes))
+    return describe_opened(config, open_source(config.repo_id, config.root))
 
 
-def describe_opened(config: AugmentConfig, source: LeRobotDatasetMetadata, episodes: Sequence[int]) -> dict[str, Any]:
+def describe_opened(config: AugmentConfig, source: LeRobotDatasetMetadata) -> dict[str, Any]:
     """The same of a source that is open."""
-    return describe_run(source.root, source_files(source, files_of(config, source, episodes)), config)
+    files = source_files(source, files_of(config, source, select_episodes(source, config.episodes)))
+    return describe_run(source.root, files, config)
 
 
 def files_of(config: AugmentConfig, source: LeRobotDatasetMetadata, episodes: Sequence[int]) -> list[int]:
@@ -124,7 +150,7 @@ def checked_output(
     Raises:
         OutputError: it cannot be made.
     """
-    check_disk(opened.source, opened.episodes, config, staging.folder)
+    check_disk(opened.source, opened.episodes, opened.rendered, config, staging.folder)
     output = OutputDataset(opened.source, new_repo_id, new_root, staging, nvenc=config.nvenc, replaces=replaces)
     output.check(opened.cameras, depth=config.render_depth)
     return output
@@ -172,7 +198,8 @@ def deliver(
         return write_report(source, folder, new_root.name, made, skipped, len(failures), seconds())
 
     output.finish(new, recipe_text(config), left_out, report, keep=keep_failed and bool(failures))
-    of_cameras = f" ({config.variants} per episode, {', '.join(cameras)})" if cameras else ""
+    some = f"for each of {len(opened.rendered)} episodes" if config.episodes_share < 1 else "per episode"
+    of_cameras = f" ({config.variants} {some}, {', '.join(cameras)})" if cameras else ""
     used = len(opened.episodes) - len(failures)
     text = (
         f"{used} of {len(opened.episodes)} episodes, {rendered} new ones{of_cameras}, {seconds():.0f} s\n"

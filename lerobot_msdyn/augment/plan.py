@@ -13,6 +13,8 @@ from lerobot_msdyn.augment.cost import (
     predicted_scene_bytes,
     predicted_seconds,
 )
+from lerobot_msdyn.augment.failures import ranges
+from lerobot_msdyn.augment.job import Opened
 from lerobot_msdyn.augment.workers import terse, threads_of_one, workers_for
 from lerobot_msdyn.dataset.select import colour_cameras, is_wrist_camera
 
@@ -20,32 +22,34 @@ TIME_RANGE = (0.75, 1.5)  # of the predicted time; chosen by hand, not measured 
 DISK_RANGE = (0.8, 1.25)  # of the predicted size; likewise
 
 
-def plan(
-    source: LeRobotDatasetMetadata, episodes: list[int], cameras: list[str], config: AugmentConfig, place: Path
-) -> str:
+def plan(opened: Opened, config: AugmentConfig, place: Path) -> str:
     """Episodes, cameras, time and disk of a run whose output would be `place`.
 
     Raises:
         EpisodeError: none of the episodes can be read.
         PriorError: a prior was demanded and cannot be had.
     """
-    frames = frames_of(source, episodes)
-    variants = config.variants if cameras else 0
-    copies = variants + int(config.include_source)
-    count = workers_for(config, frames, len(episodes))
+    source, episodes, rendered, cameras = opened.source, opened.episodes, opened.rendered, opened.cameras
+    frames, frames_seen = frames_of(source, episodes), frames_of(source, rendered)
+    variants, copies = config.variants if cameras else 0, int(config.include_source)
+    count = workers_for(config, frames_seen, len(rendered))
     with threads_of_one(count), terse(config):
-        speeds = first_speeds(source, episodes, cameras, config)
-    seconds = predicted_seconds(speeds, source, episodes, config, count)
-    scenes = predicted_scene_bytes(speeds, source, episodes, config) if config.save_scenes else 0.0
-    disk = predicted_bytes(speeds, source, episodes, config) + scenes
+        speeds = first_speeds(source, rendered, cameras, config)
+    seconds = predicted_seconds(speeds, source, rendered, config, count)
+    scenes = predicted_scene_bytes(speeds, source, rendered, config) if config.save_scenes else 0.0
+    disk = predicted_bytes(speeds, source, episodes, rendered, config) + scenes
     each = "the recorded one and " if config.include_source else ""
+    new = f"for each that is read: {each}{variants} new"
+    if config.episodes_share < 1:
+        new = f"{variants} new for each of {len(rendered)}, chosen to cover what was recorded: {ranges(rendered)}"
+    written, pictures = len(episodes) * copies + len(rendered) * variants, frames_seen * variants * len(cameras)
     by = "one process" if count == 1 else f"{count} processes"
     kept = f", {_range(scenes / 1e6, DISK_RANGE)} MB of it saved scenes" if scenes else ""
     rows = [
         ("reads", f"{_count(len(episodes), 'episode')}, {frames} frames, of {source.repo_id}"),
         *(("camera", line) for line in camera_lines(source, cameras, config)),
-        ("writes", f"{_count(len(episodes) * copies, 'episode')}, {frames * copies} frames, to {place}"),
-        ("", f"for each that is read: {each}{variants} new; {frames * variants * len(cameras)} new pictures"),
+        ("writes", f"{_count(written, 'episode')}, {frames * copies + frames_seen * variants} frames, to {place}"),
+        ("", f"{new}; {pictures} new pictures"),
         ("time", f"{_duration(seconds)} on this machine by {by}, judging by {PROBE_FRAMES} frames of one episode"),
         ("disk", f"{_range(disk / 1e6, DISK_RANGE)} MB{kept}; about twice as much until the run ends"),
     ]

@@ -3,7 +3,7 @@
 import contextlib
 import functools
 import logging
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import torch
@@ -16,6 +16,7 @@ from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.augment.earlier_scenes import problems_of_scenes
 from lerobot_msdyn.augment.episode import augment_episode
 from lerobot_msdyn.augment.failures import same_reason
+from lerobot_msdyn.augment.job import Opened
 from lerobot_msdyn.augment.plan import camera_lines
 from lerobot_msdyn.augment.progress import EpisodeBar
 from lerobot_msdyn.augment.robot_cameras import calibrated
@@ -35,23 +36,18 @@ from lerobot_msdyn.render.devices import chosen_device
 logger = logging.getLogger(__name__)
 
 
-def prepared(
-    source: LeRobotDatasetMetadata,
-    episodes: list[int],
-    cameras: list[str],
-    config: AugmentConfig,
-    output: OutputDataset,
-) -> tuple[AugmentConfig, dict[int, str]]:
+def prepared(opened: Opened, config: AugmentConfig, output: OutputDataset) -> tuple[AugmentConfig, dict[int, str]]:
     """What is found out once, before any work: the settings with where cameras stand, and what no file is there for.
 
     The second is why an episode cannot be read, by its number, as far as that is seen without opening its files.
     """
     chosen_device(config.device)  # complains, or says what is used, before anything is done
     check_named_providers(config.priors, config.camera, config.device)
-    problems = problems_of(source, episodes, cameras, config)
+    source, cameras = opened.source, opened.cameras
+    problems = problems_of(source, opened.episodes, opened.rendered, cameras, config)
     if config.scenes is not None:
         return config, problems
-    whole = [index for index in episodes if index not in problems]
+    whole = [index for index in opened.episodes if index not in problems]
     if whole:
         config = calibrated(source, whole, cameras, config, output.staging.folder / CALIBRATION)
     _say_what_is_assumed(source, cameras, config)
@@ -59,36 +55,40 @@ def prepared(
 
 
 def problems_of(
-    source: LeRobotDatasetMetadata, episodes: Sequence[int], cameras: Sequence[str], config: Recipe
+    source: LeRobotDatasetMetadata,
+    episodes: Sequence[int],
+    rendered: Collection[int],
+    cameras: Sequence[str],
+    config: Recipe,
 ) -> dict[int, str]:
-    """Why episodes cannot be read, or have no scenes where --scenes names some, without opening their files."""
+    """Why episodes cannot be read, or those to be rendered have no scenes where --scenes names some.
+
+    As far as that is seen without opening the episodes' files.
+    """
     files = {index: files_problem(source, index) for index in episodes}
     problems = {index: problem for index, problem in files.items() if problem}
     if config.scenes is None:
         return problems
-    return problems_of_scenes(source, episodes, cameras, config.scenes) | problems
+    wanted = [index for index in episodes if index in rendered]
+    return problems_of_scenes(source, wanted, cameras, config.scenes) | problems
 
 
-def run_local(
-    source: LeRobotDatasetMetadata,
-    episodes: list[int],
-    cameras: list[str],
-    config: AugmentConfig,
-    output: OutputDataset,
-) -> dict[int, str]:
+def run_local(opened: Opened, config: AugmentConfig, output: OutputDataset) -> dict[int, str]:
     """Finish all episodes on this machine; returns why some failed: every reason is logged once."""
-    config, problems = prepared(source, episodes, cameras, config, output)
+    source, episodes = opened.source, opened.episodes
+    config, problems = prepared(opened, config, output)
     failures: dict[int, str] = {}
     reasons: set[str] = set()
     before = 0.0 if output.staging.has(BACKGROUNDS) else background_worth(source, config)
-    with logging_redirect_tqdm(), EpisodeBar(len(episodes), what="looking at the background", before=before) as bar:
+    count = len(opened.rendered)
+    with logging_redirect_tqdm(), EpisodeBar(count, what="looking at the background", before=before) as bar:
 
         def progress(what: str, share: float) -> None:
             if what:
                 bar.begin(what)
             bar.advance(share)
 
-        work = Work(source, cameras, config, output, progress)
+        work = Work(source, frozenset(opened.rendered), opened.cameras, config, output, progress)
         for index, failure in attempts(work, episodes, problems):
             if failure is None:
                 continue
@@ -97,7 +97,7 @@ def run_local(
             if reason not in reasons:
                 reasons.add(reason)
                 logger.error("skipped: %s", failures[index])
-        bar.advance(before + len(episodes))
+        bar.advance(before + count)
     return failures
 
 
@@ -127,7 +127,7 @@ def attempts(work: Work, episodes: list[int], problems: Mapping[int, str]) -> It
 
 def _attempts(work: Work, episodes: list[int]) -> Generator[str | None]:
     """Why each episode failed, or nothing; by this process or, where that pays, by several."""
-    unfinished = [index for index in episodes if not work.output.is_finished(index)]
+    unfinished = [index for index in episodes if index in work.rendered and not work.output.is_finished(index)]
     frames = sum(int(work.source.episodes[index]["length"]) for index in unfinished)
     count = workers_for(work.config, frames, len(unfinished))
     if count == 1:
@@ -165,7 +165,7 @@ def _make(work: Work, index: int) -> Callable[[], list[NewEpisode]]:
         augment_episode,
         work.source,
         index,
-        work.cameras,
+        work.cameras if index in work.rendered else [],
         work.config,
         work.output,
         work.progress,

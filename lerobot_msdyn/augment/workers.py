@@ -26,7 +26,7 @@ from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.augment.episode import Progress
 from lerobot_msdyn.core.cli import quiet_libraries
 from lerobot_msdyn.core.plugins import import_plugins, imported_plugins
-from lerobot_msdyn.core.processes import Processes
+from lerobot_msdyn.core.processes import Processes, cores
 from lerobot_msdyn.dataset.read import open_source
 from lerobot_msdyn.dataset.staging import BACKGROUNDS, Staging
 from lerobot_msdyn.dataset.video import quiet_encoders
@@ -44,6 +44,7 @@ class Work:
     """What a run works on, in any of its processes."""
 
     source: LeRobotDatasetMetadata
+    rendered: frozenset[int]  # the episodes that get new ones
     cameras: list[str]
     config: AugmentConfig
     output: OutputDataset
@@ -74,6 +75,7 @@ class _Place:
     plugins: list[str]
     repo_id: str
     root: Path
+    rendered: frozenset[int]
     cameras: list[str]
     settings: dict[str, Any]
     new_repo_id: str
@@ -83,7 +85,16 @@ class _Place:
 def _place_of(work: Work) -> _Place:
     source, output = work.source, work.output
     settings = draccus.encode(work.config)
-    return _Place(imported_plugins(), source.repo_id, source.root, work.cameras, settings, output.repo_id, output.root)
+    return _Place(
+        imported_plugins(),
+        source.repo_id,
+        source.root,
+        work.rendered,
+        work.cameras,
+        settings,
+        output.repo_id,
+        output.root,
+    )
 
 
 def _config_at(place: _Place) -> AugmentConfig:
@@ -116,11 +127,6 @@ def threads_of_one(count: int) -> Iterator[None]:
 
 def _share_of_threads(count: int) -> int:
     return max(1, torch.get_num_threads() // count)
-
-
-def cores() -> int:
-    """Of this machine, that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _memory() -> int:
@@ -163,7 +169,7 @@ def _begin(place: _Place, threads: int, progress: Progress) -> Work:
     source = open_source(place.repo_id, place.root, config.tolerance_s)
     staging = Staging(place.new_root, lock=False)
     output = OutputDataset(source, place.new_repo_id, place.new_root, staging, nvenc=config.nvenc)
-    return Work(source, place.cameras, config, output, progress)
+    return Work(source, place.rendered, place.cameras, config, output, progress)
 
 
 @contextlib.contextmanager

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from lerobot_msdyn.cluster.config import ESSENTIALS, ClusterConfig
 from lerobot_msdyn.core.cli import EXIT_OK, EXIT_SOME_EPISODES_FAILED, parse_config, run_command
 from lerobot_msdyn.core.errors import ConfigError
+from lerobot_msdyn.dataset.named import check_there
 
 if TYPE_CHECKING:
     from lerobot_msdyn.cluster.task import Job
@@ -29,6 +30,7 @@ def run(arguments: list[str]) -> int:
         raise ConfigError(f"which dataset? {COMMAND} --repo NAME [--root FOLDER] (see --help)")
     if importlib.util.find_spec("datatrove") is None:
         raise ConfigError("cluster needs datatrove; install it with: pip install 'lerobot_msdyn[cluster]'")
+    check_there(config.repo_id, config.root)
     from lerobot_msdyn.augment.job import finished_before
     from lerobot_msdyn.augment.run_identity import source_folder
     from lerobot_msdyn.cluster.plan import job_of

@@ -81,6 +81,7 @@ ESSENTIALS = Essentials(
         "new_repo_id",
         "episodes",
         "variants",
+        "episodes_share",
         "executor",
         "tasks",
         "partition",

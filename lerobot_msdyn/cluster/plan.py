@@ -13,15 +13,15 @@ from lerobot_msdyn.augment.cost import (
     predicted_episode_seconds,
     predicted_output_bytes,
 )
-from lerobot_msdyn.augment.job import Opened, place_of
-from lerobot_msdyn.augment.workers import cores, most_workers, terse, threads_of_one
+from lerobot_msdyn.augment.job import Opened, chosen_episodes, place_of
+from lerobot_msdyn.augment.workers import most_workers, terse, threads_of_one
 from lerobot_msdyn.cluster.config import ClusterConfig, job_settings
-from lerobot_msdyn.cluster.shards import shards
+from lerobot_msdyn.cluster.shards import frames_to_render, shards
 from lerobot_msdyn.cluster.stages import finished_in
 from lerobot_msdyn.cluster.task import Job
 from lerobot_msdyn.core.plugins import imported_plugins
+from lerobot_msdyn.core.processes import cores
 from lerobot_msdyn.dataset.read import open_source
-from lerobot_msdyn.dataset.select import select_episodes
 
 SHOWN = 16  # tasks, each by a line
 
@@ -61,13 +61,12 @@ def unfinished_ranks(job: Job) -> list[int]:
     """Tasks with episodes that are not finished, whatever their completion markers say."""
     config = job.config()
     source = open_source(config.repo_id, config.root, config.tolerance_s)
-    episodes = select_episodes(source, config.episodes)
+    opened = Opened(source, *chosen_episodes(source, config), cameras=[])
     finished = finished_in(job.place("command"))
-    frames = [int(source.episodes[index]["length"]) for index in episodes]
     return [
         rank
-        for rank, places in enumerate(shards(frames, job.tasks))
-        if any(episodes[place] not in finished for place in places)
+        for rank, places in enumerate(shards(frames_to_render(opened), job.tasks))
+        if any(opened.episodes[place] not in finished for place in places)
     ]
 
 
@@ -75,19 +74,21 @@ def cost_table(opened: Opened, config: AugmentConfig, job: Job) -> str:
     """Episodes, frames, minutes and disk of each task, judging by a little of the work on this machine."""
     source = opened.source
     with threads_of_one(max(1, job.processes)), terse(config):
-        speeds = first_speeds(source, opened.episodes, opened.cameras, config)
-    background_s = predicted_background_seconds(speeds, source, opened.episodes, config, job.processes)
-    frames = [int(source.episodes[index]["length"]) for index in opened.episodes]
+        speeds = first_speeds(source, opened.rendered, opened.cameras, config)
+    background_s = predicted_background_seconds(speeds, source, opened.rendered, config, job.processes)
+    frames, rendered = frames_to_render(opened), set(opened.rendered)
     lines, minutes = [], []
     for rank, places in enumerate(shards(frames, job.tasks)):
         mine = [opened.episodes[place] for place in places]
-        minutes.append(predicted_episode_seconds(speeds, source, mine, config, job.processes) / 60)
-        disk = predicted_output_bytes(source, mine, config) / 1e6
+        new = [index for index in mine if index in rendered]
+        minutes.append(predicted_episode_seconds(speeds, source, new, config, job.processes) / 60)
+        disk = predicted_output_bytes(source, mine, new, config) / 1e6
         count = sum(frames[place] for place in places)
         lines.append(f"{rank:6d}  {len(mine):8d}  {count:9d}  {minutes[-1]:8.1f}  {disk:8.1f}\n")
+    some = f" of {len(rendered)} of them" if len(rendered) < len(opened.episodes) else ""
     more = f"   ...  and {len(lines) - SHOWN} more\n" if len(lines) > SHOWN else ""
     return (
-        f"{source.repo_id}: {len(opened.episodes)} episodes, {sum(frames)} frames, re-rendering "
+        f"{source.repo_id}: {len(opened.episodes)} episodes, {sum(frames)} frames{some}, re-rendering "
         f"{', '.join(opened.cameras) or 'nothing'}; {job.tasks} tasks of {job.processes} "
         f"{'process' if job.processes == 1 else 'processes'}\n"
         f"before them, the background: {background_s / 60:.1f} minutes\n"

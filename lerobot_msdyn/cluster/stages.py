@@ -25,7 +25,7 @@ from lerobot_msdyn.augment.robot_cameras import calibrated_before
 from lerobot_msdyn.augment.run import attempts, prepared, problems_of, share_background
 from lerobot_msdyn.augment.run_identity import describe_run
 from lerobot_msdyn.augment.workers import Work, terse
-from lerobot_msdyn.cluster.shards import shard
+from lerobot_msdyn.cluster.shards import frames_to_render, shard
 from lerobot_msdyn.cluster.task import RESULT, Job, Place, errors_in, write_json
 from lerobot_msdyn.core.errors import OutputError, WorkerError
 from lerobot_msdyn.dataset.provenance import CALIBRATION, read_provenance
@@ -51,6 +51,7 @@ BACKGROUND, EPISODES, MERGE = "background", "episodes", "merge"
 FINISHED_FILE = f"{FINISHED}.safetensors"
 COMMON = (RUN, f"{BACKGROUNDS}.safetensors", f"{SHARED}.safetensors", CALIBRATION)  # what the first step leaves
 DATASET = "dataset"  # of a store: where the output is put
+CHOSEN = ("episodes", "rendered", "cameras")  # of what is opened, chosen by the first step
 OPTIONAL = ("transformers", "timm", "onnxruntime", "pycolmap", "yourdfpy", "gsplat")  # decide on what `auto` takes
 SHOWN_ERRORS = 5
 
@@ -75,12 +76,12 @@ def background(job: Job) -> None:
     staging = Staging(place.new_root)
     try:
         opened = open_job(config, config.root)
-        staging.agree(describe_opened(config, opened.source, opened.episodes))
+        staging.agree(describe_opened(config, opened.source))
         output = checked_output(config, opened, job.new_repo_id, place.new_root, staging, replaces=True)
         with terse(config):
-            config, _ = prepared(*_parts(opened), config, output)
-            share_background(Work(opened.source, opened.cameras, config, output, _no_progress))
-        found = {"episodes": opened.episodes, "cameras": opened.cameras} | what_is_here()
+            config, _ = prepared(opened, config, output)
+            share_background(_work(opened, config, output))
+        found = {name: getattr(opened, name) for name in CHOSEN} | what_is_here()
         staging.keep(SHARED, lambda: found)
     finally:
         staging.close(stopped=True)
@@ -99,15 +100,17 @@ def episodes(job: Job, rank: int, world_size: int) -> Iterator[Progress]:
     shared = _shared(staging)
     source = open_source(config.repo_id, config.root, config.tolerance_s)
     _check_same(staging, shared, source, config)
-    frames = [int(source.episodes[index]["length"]) for index in shared["episodes"]]
-    mine = [shared["episodes"][i] for i in shard(frames, rank, world_size)]
+    opened = Opened(source, **{name: shared[name] for name in CHOSEN})
+    mine = [opened.episodes[i] for i in shard(frames_to_render(opened), rank, world_size)]
     done = finished_in(place)
     unfinished = [index for index in mine if index not in done]
     output = OutputDataset(source, job.new_repo_id, place.new_root, staging, nvenc=config.nvenc, replaces=True)
     config = calibrated_before(config, staging.folder / CALIBRATION)
-    work = Work(source, shared["cameras"], config, output, _no_progress)
+    work = _work(opened, config, output)
     with terse(config):
-        for index, failure in attempts(work, unfinished, problems_of(source, unfinished, work.cameras, config)):
+        for index, failure in attempts(
+            work, unfinished, problems_of(source, unfinished, work.rendered, work.cameras, config)
+        ):
             if failure is not None:
                 logger.error("skipped: %s", failure)
                 output.episode(index).say_failed(failure)
@@ -151,7 +154,7 @@ def merge(job: Job, errors: dict[int, str] | None = None) -> None:
             logger.info("%s has all that is finished", place.new_root)
             return
         source = open_source(config.repo_id, config.root, config.tolerance_s)
-        opened = Opened(source, wanted, shared["cameras"])
+        opened = Opened(source, **{name: shared[name] for name in CHOSEN})
         output = OutputDataset(source, job.new_repo_id, place.new_root, staging, nvenc=config.nvenc, replaces=True)
         text, left_out = deliver(config, opened, output, failures, lambda: time.time() - begun, keep_failed=True)
     if place.store is not None:
@@ -187,12 +190,10 @@ def _begin(job: Job, task: str) -> tuple[AugmentConfig, Place]:
     return job.config(), job.place(task)
 
 
-def _parts(opened: Opened) -> tuple[LeRobotDatasetMetadata, list[int], list[str]]:
-    return opened.source, opened.episodes, opened.cameras
-
-
-def _no_progress(what: str, share: float) -> None:
-    pass
+def _work(opened: Opened, config: AugmentConfig, output: OutputDataset) -> Work:
+    return Work(
+        opened.source, frozenset(opened.rendered), opened.cameras, config, output, progress=lambda what, share: None
+    )
 
 
 def _finished_here(folder: Path) -> set[int]:

@@ -28,6 +28,11 @@ END = b""  # what its parent tells a worker that is not needed any more
 END_S = 10.0  # after which such a worker is killed
 
 
+def cores() -> int:
+    """Of this machine, that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 class Processes[S]:
     """Some worker processes, started when they are first needed. Use as a context; none is left behind."""
 

@@ -4,9 +4,10 @@ import difflib
 import os
 from pathlib import Path
 
-from huggingface_hub import HfApi, constants
+from huggingface_hub import constants
 
 from lerobot_msdyn.core.errors import DatasetError
+from lerobot_msdyn.core.files import check_root
 
 HUB_TIMEOUT_S = 10
 INFO_PLACES = "*/*/meta/info.json"  # of the datasets in LeRobot's home
@@ -15,6 +16,18 @@ INFO_PLACES = "*/*/meta/info.json"  # of the datasets in LeRobot's home
 def lerobot_home() -> Path:
     """Where LeRobot keeps datasets: `lerobot.utils.constants.HF_LEROBOT_HOME`."""
     return Path(os.environ.get("HF_LEROBOT_HOME", Path(constants.HF_HOME) / "lerobot")).expanduser()
+
+
+def check_there(repo_id: str, root: Path | None) -> None:
+    """Whether there is a dataset in a folder or, without one, of a name: before slow imports.
+
+    Raises:
+        DatasetError: there is none.
+    """
+    if root is None:
+        check_named(repo_id)
+    else:
+        check_root(root)
 
 
 def check_named(repo_id: str) -> None:
@@ -29,6 +42,8 @@ def check_named(repo_id: str) -> None:
     downloaded = home / "hub" / f"datasets--{repo_id.replace('/', '--')}"
     if (home / repo_id / "meta" / "info.json").exists() or downloaded.exists():
         return
+    from huggingface_hub import HfApi  # only now: its clients take as long to import as all of the help
+
     try:
         HfApi().dataset_info(repo_id, timeout=HUB_TIMEOUT_S)
     except Exception as error:  # several libraries take part, each with errors of its own

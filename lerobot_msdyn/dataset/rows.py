@@ -1,6 +1,7 @@
 """The parquet rows of one episode, bit for bit, once they are what the metadata says."""
 
 from collections import Counter
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,27 @@ def read_rows(meta: LeRobotDatasetMetadata, index: int) -> pa.Table:
     return rows
 
 
+def read_columns(meta: LeRobotDatasetMetadata, index: int, keys: Sequence[str]) -> dict[str, np.ndarray]:
+    """Some numeric columns [t, ...] of one episode, in order, where no more of it is needed.
+
+    Raises:
+        EpisodeError: they cannot be read, or there is not one row for each frame.
+    """
+    where = f"{meta.repo_id} episode {index}"
+    problem = place_problem(meta.episodes[index], meta.video_keys)
+    if problem is not None:
+        raise EpisodeError(f"{where}: meta/episodes says that {problem}")
+    files = [source_file(meta, index, file) for file in data_files(meta, index)]
+    try:
+        rows = pa.concat_tables([_read(file, index, [*keys, "frame_index"]) for file in files]).sort_by("frame_index")
+        columns = {key: values_of(rows, key, meta.features[key]) for key in keys}
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, pa.ArrowException) as error:
+        raise EpisodeError(f"{where}: {files[0]} cannot be read ({first_line(error)})") from error
+    if rows.num_rows != int(meta.episodes[index]["length"]):
+        raise EpisodeError(f"{where}: {files[0]} has {rows.num_rows} rows; expected {meta.episodes[index]['length']}")
+    return columns
+
+
 def data_files(meta: LeRobotDatasetMetadata, index: int) -> list[Path]:
     """The data files, relative to the dataset, that hold the rows of an episode.
 
@@ -69,13 +91,17 @@ def data_files(meta: LeRobotDatasetMetadata, index: int) -> list[Path]:
     return [path for path, count in found.items() if count] if sum(found.values()) == length else [named]
 
 
-def _read(path: Path, episode: int) -> pa.Table:
-    """The rows of one episode in a data file; of its row groups, only those that can hold them are read."""
+def _read(path: Path, episode: int, columns: Sequence[str] | None = None) -> pa.Table:
+    """The rows of one episode in a data file; of its row groups, only those that can hold them are read.
+
+    `columns`: which of the file's are needed; default: all.
+    """
+    read = None if columns is None else [*columns, "episode_index"]
     about = path.stat()
     metadata, spans = _layout(path, about.st_mtime_ns, about.st_size)
     groups = [number for number, span in enumerate(spans) if span is None or span[0] <= episode <= span[1]]
     with pq.ParquetFile(path, metadata=metadata) as file:
-        rows = file.read_row_groups(groups)
+        rows = file.read_row_groups(groups, columns=read)
     return rows.filter(pc.equal(rows["episode_index"], episode))
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from lerobot_msdyn.core.cli import EXIT_OK, parse_config, run_command
 from lerobot_msdyn.core.errors import ConfigError
+from lerobot_msdyn.dataset.named import check_there
 from lerobot_msdyn.evaluate.config import DycheckConfig, EvaluateConfig, HeldoutCameraConfig
 
 COMMAND = "python -m lerobot_msdyn.evaluate"
@@ -30,6 +31,7 @@ def _dycheck(config: DycheckConfig) -> str:
 
 
 def _heldout_camera(config: HeldoutCameraConfig) -> str:
+    check_there(config.repo_id, config.root)
     from lerobot_msdyn.evaluate.heldout import evaluate_heldout
 
     return evaluate_heldout(config).text()

@@ -14,6 +14,7 @@ from lerobot_msdyn.core.cli import EXIT_OK, EXIT_SOME_EPISODES_FAILED, parse_con
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import ConfigError, EpisodeError, OutputError
 from lerobot_msdyn.core.fields import between
+from lerobot_msdyn.dataset.named import check_there
 
 if TYPE_CHECKING:
     from lerobot_msdyn.dataset.read import Episode
@@ -48,6 +49,7 @@ def run(arguments: list[str]) -> int:
     for name, given in (("repo", config.repo_id != ""), ("out", config.out != Path())):
         if not given:
             raise ConfigError(f"--{name} is missing; expected: {COMMAND} --repo NAME [--root FOLDER] --out DIR")
+    check_there(config.repo_id, config.root)
     from lerobot_msdyn.dataset.read import open_source, read_episode
     from lerobot_msdyn.dataset.select import select_cameras, select_episodes
 

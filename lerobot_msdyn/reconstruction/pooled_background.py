@@ -3,7 +3,7 @@
 import logging
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -127,23 +127,42 @@ def adapted(shared: SharedBackground, own: EmptyScene, fresh: Gaussians) -> Gaus
     """
     assert shared.static is not None
     match = colour_match(shared.empty, own)
-    grid = round(math.sqrt(own.seen.numel() / len(fresh)))
-    mine = (shared.empty.seen < SURE_FRAMES) | ((own.depth > 0) & (shared.empty.depth == 0))
-    mine |= _differs(match.applied(shared.empty.rgb), shared.empty, own)
-    window = scaled_window(MARGIN_PX, mine.shape[1])
-    differs = torch.from_numpy(cv2.dilate(mine.numpy().astype(np.uint8), window) > 0)
-    rows = differs[grid // 2 :: grid, grid // 2 :: grid].reshape(-1)
-    logger.info("%.1f %% of the shared background is another in this episode", 100 * float(rows.float().mean()))
+    differs = differing(shared.empty, own)
+    logger.info("%.1f %% of the shared background is another in this episode", 100 * float(differs.float().mean()))
     rgb = shared.static.rgb * match.factor + match.offset / 255
-    kept = replace(shared.static, sh=rgb_to_sh(rgb))
+    return exchanged(replace(shared.static, sh=rgb_to_sh(rgb)), fresh, differs)
+
+
+def differing(shared: EmptyScene, own: EmptyScene) -> Bool[Tensor, "h w"]:
+    """Where an episode's empty scene is another than the shared one, beyond exposure, or the shared one is unknown."""
+    mine = (shared.seen < SURE_FRAMES) | ((own.depth > 0) & (shared.depth == 0))
+    mine |= _differs(colour_match(shared, own).applied(shared.rgb), shared, own)
+    return torch.from_numpy(cv2.dilate(mine.numpy().astype(np.uint8), scaled_window(MARGIN_PX, mine.shape[1])) > 0)
+
+
+def continued(first: EmptyScene, own: EmptyScene, differs: Bool[Tensor, "h w"]) -> EmptyScene:
+    """The empty scene of a video's first window, but what a later one shows where it differs."""
+    return EmptyScene(
+        torch.where(differs[..., None], own.rgb, first.rgb),
+        torch.where(differs, own.depth, first.depth),
+        torch.where(differs, own.seen, first.seen),
+    )
+
+
+def exchanged(gaussians: Gaussians, others: Gaussians, where: Bool[Tensor, "h w"]) -> Gaussians:
+    """A Gaussian per pixel of the grid of `background_gaussians`, with others in its place at some pixels.
+
+    Raises:
+        ValueError: there are as many as in another grid.
+    """
+    grid = round(math.sqrt(where.numel() / len(others)))
+    rows = where[grid // 2 :: grid, grid // 2 :: grid].reshape(-1).to(others.means.device)
+    if not len(rows) == len(gaussians) == len(others):
+        raise ValueError(f"{len(gaussians)} and {len(others)} Gaussians; expected {len(rows)} of each")
     return Gaussians(
         **{
-            item.name: torch.where(
-                rows.reshape(-1, *[1] * (getattr(fresh, item.name).dim() - 1)),
-                getattr(fresh, item.name),
-                getattr(kept, item.name),
-            )
-            for item in fields(Gaussians)
+            name: torch.where(rows.reshape(-1, *[1] * (tensor.dim() - 1)), tensor, getattr(gaussians, name))
+            for name, tensor in vars(others).items()
         }
     )
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import concatenated
@@ -29,7 +30,14 @@ from lerobot_msdyn.reconstruction.initialise import initialise
 from lerobot_msdyn.reconstruction.key_views import KeyView, fixed_view, key_views
 from lerobot_msdyn.reconstruction.make_overlay import overlay_of
 from lerobot_msdyn.reconstruction.make_short_lived import short_lived_of
-from lerobot_msdyn.reconstruction.pooled_background import SharedBackground, adapted, completed
+from lerobot_msdyn.reconstruction.pooled_background import (
+    SharedBackground,
+    adapted,
+    completed,
+    continued,
+    differing,
+    exchanged,
+)
 from lerobot_msdyn.reconstruction.prune import without_contradicted
 from lerobot_msdyn.reconstruction.result import FittedWindow, Reconstruction
 from lerobot_msdyn.reconstruction.self_check import SelfCheck, self_check
@@ -59,6 +67,8 @@ class Draft:
     device: torch.device
     path: CameraPath | None = None  # from the camera's usual place to where it is at each frame; None: it keeps still
     shared: SharedBackground | None = None  # the one that fits this window
+    first: SharedBackground | None = None  # what the first window from the same place shows where nothing moves
+    differs: Bool[Tensor, "h w"] | None = None  # where this one shows something else; None: there is no first one
     priors: Priors = field(init=False)
     keys: Sequence[KeyView] = field(init=False)  # what stands still
     distance: float = field(init=False)  # m, to the look-at point
@@ -117,6 +127,10 @@ def _background(draft: Draft) -> None:
         keys = key_views(draft.view, draft.priors)
     if draft.shared is not None:
         keys = fixed_view(completed(keys[0].empty, draft.shared.empty, len(draft.view)), draft.view.camera)
+    if draft.first is not None and draft.first.fits(draft.view):
+        empty = keys[0].empty
+        draft.differs = differing(draft.first.empty, empty)
+        keys = fixed_view(continued(draft.first.empty, empty, draft.differs), draft.view.camera)
     draft.stand_before(keys)
 
 
@@ -125,6 +139,7 @@ def _initial_scene(draft: Draft) -> None:
     scene = initialise(draft.view, draft.priors, draft.recipe.scene, draft.recipe.motion, draft.keys)
     if draft.shared is not None and draft.shared.static is not None:
         scene = replace(scene, static=adapted(draft.shared, draft.keys[0].empty, scene.static))
+    scene = _continued(scene, draft)
     draft.scene = replace(scene, near=NEAR * draft.distance)
 
 
@@ -143,8 +158,17 @@ def _fit(draft: Draft) -> None:
         seed=draft.recipe.seed,
         progress=lambda done: draft.progress(done / config.steps),
     )
-    draft.scene = draft.fitted.scene
+    draft.scene = _continued(draft.fitted.scene, draft)
     draft.view = replace(draft.view, camera=draft.fitted.camera)
+
+
+def _continued(scene: DynamicScene, draft: Draft) -> DynamicScene:
+    """With what stands still as it was fitted in the first window, so that nothing jumps where the next one begins."""
+    if draft.differs is None or draft.first is None or draft.first.static is None:
+        return scene
+    if len(scene.static) != len(draft.first.static):  # density control gives every window Gaussians of its own
+        return scene
+    return replace(scene, static=exchanged(to_device(draft.first.static, scene.device), scene.static, draft.differs))
 
 
 def _prune(draft: Draft) -> None:
@@ -251,6 +275,7 @@ def reconstruct(
     small_others = [other.shrunk(recipe.fit.max_width) for other in others]
     device = chosen_device(recipe.device)
     fitted: list[FittedWindow] = []
+    first: SharedBackground | None = None
     metric, provenance, distances, ups = [], [], [], []
     for part in parts:
         frames = slice(part.start, part.start + len(part.view))
@@ -268,13 +293,16 @@ def reconstruct(
             return progress(share / len(parts))
 
         small = part.view.shrunk(recipe.fit.max_width)
-        draft = Draft(small, recipe, view.camera.width, estimate, backgrounds, within, device, part.path)
+        draft = Draft(small, recipe, view.camera.width, estimate, backgrounds, within, device, part.path, first=first)
         with torch_on_one_thread():
             for name, step in steps.items():
                 begin = time.perf_counter()
                 step(draft)
                 draft.seconds[name] = time.perf_counter() - begin
         fitted.append(draft.window(part.start))
+        if draft.differs is None and draft.view.camera.is_static:
+            static = to_device(draft.fitted.scene.static, "cpu")
+            first = SharedBackground(draft.keys[0].empty, draft.view.camera.select([0]), part.view.rgb[:0], static)
         metric.append(draft.priors.metric)
         provenance.append(draft.priors.provenance)
         distances.append(draft.distance)

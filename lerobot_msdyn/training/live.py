@@ -1,5 +1,6 @@
 """Single frames of a saved scene from new cameras, as fast as training needs them."""
 
+import threading
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,12 +29,13 @@ class LivePictures:
 
 
 class LiveScene:
-    """A saved scene, prepared for rendering single frames; not for several threads at once."""
+    """A saved scene, prepared for rendering single frames; several threads take turns."""
 
     def __init__(self, scene: SavedScene) -> None:
         """Prepare every window."""
         self.scene = scene
         self._windows = [_LiveWindow(window) for window in scene.windows]
+        self._turn = threading.Lock()  # whose thread writes to the buffers of the windows
 
     @property
     def size_in_bytes(self) -> int:
@@ -49,7 +51,8 @@ class LiveScene:
         windows = self.scene.windows_of(frames).tolist()
         for i, (number, frame) in enumerate(zip(windows, frames.tolist(), strict=True)):
             window, start = self._windows[number], self.scene.starts[number]
-            colours, distance, alpha = window.render(camera.select([i]), frame - start)
+            with self._turn:
+                colours, distance, alpha = window.render(camera.select([i]), frame - start)
             opaque = alpha >= HOLE_ALPHA
             opacity[i] = alpha
             rgb[i] = filled_softly(colours, opaque)

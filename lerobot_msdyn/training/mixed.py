@@ -9,6 +9,8 @@ import torch
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_msdyn.core.perturbation import Perturbation
+from lerobot_msdyn.core.processes import cores
+from lerobot_msdyn.render.cpu.threads import begun
 from lerobot_msdyn.training.config import MixedViewsConfig
 from lerobot_msdyn.training.mixer import ViewMixer, colour_sample, depth_sample
 from lerobot_msdyn.training.scene_cache import Scenes
@@ -81,14 +83,45 @@ class MixedViews(torch.utils.data.Dataset):
             return [self._sample(i) for i in range(*index.indices(len(self)))]
         return self._sample(range(len(self))[index])
 
+    def __getitems__(self, indices: list[int]) -> list[dict[str, Any]]:
+        """The samples of a batch, as a data loader asks for them.
+
+        In a loader's worker, new views are rendered beside the reading of recorded samples, where there are more cores
+        than workers.
+        """
+        samples = [range(len(self))[index] for index in indices]
+        replaced = {index: self._replaced(index) for index in samples}
+        rendered = [index for index, (_, _, cameras) in replaced.items() if cameras]
+        helpers = _free_cores()
+        if helpers == 0 or not rendered:
+            return [self._sample(index) for index in samples]
+        pictures = dict(zip(rendered, begun(self._pictures, rendered, helpers), strict=True))
+        read = {index: dict(self.dataset[index]) for index in replaced if index not in pictures}
+        for index in reversed(rendered):
+            read[index] = with_pictures(self.dataset, index, pictures[index](), self.mixer)
+        return [read[index] for index in samples]
+
     def _sample(self, index: int) -> dict[str, Any]:
+        if not self._replaced(index)[2]:
+            return dict(self.dataset[index])
+        return with_pictures(self.dataset, index, self._pictures(index), self.mixer)
+
+    def _replaced(self, index: int) -> tuple[int, int, list[str]]:
+        """Of a sample: its place in the whole dataset, its episode, and which of its cameras are rendered."""
         absolute = index if self._absolute is None else int(self._absolute[index])
         episode = int(np.searchsorted(self._starts, absolute, side="right")) - 1
-        cameras = self.mixer.replaced(episode, absolute)
-        if not cameras:
-            return dict(self.dataset[index])
-        pictures = self.mixer.render(episode, absolute - int(self._starts[episode]), absolute, cameras)
-        return with_pictures(self.dataset, index, pictures, self.mixer)
+        return absolute, episode, self.mixer.replaced(episode, absolute)
+
+    def _pictures(self, index: int) -> dict[str, np.ndarray]:
+        """The rendered ones of a sample."""
+        absolute, episode, cameras = self._replaced(index)
+        return self.mixer.render(episode, absolute - int(self._starts[episode]), absolute, cameras)
+
+
+def _free_cores() -> int:
+    """Cores of this process's share in which nothing runs yet, where it is one of a data loader's workers."""
+    worker = torch.utils.data.get_worker_info()
+    return 0 if worker is None else max(0, cores() // worker.num_workers - 1)
 
 
 def with_pictures(

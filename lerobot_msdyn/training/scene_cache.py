@@ -1,5 +1,6 @@
 """The scenes that were used last, within a bound of memory."""
 
+import threading
 from collections import OrderedDict
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,10 +20,11 @@ class SceneCache:
         """Nothing is loaded yet; the scene in use is kept even where it alone is above the bound."""
         self.scenes, self.memory_mb = scenes, memory_mb
         self._live: OrderedDict[tuple[int, str], LiveScene] = OrderedDict()
+        self._turn = threading.Lock()  # of threads that ask for scenes
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __reduce__(self) -> tuple[Any, ...]:
         """Another process loads its own."""
-        return self.__dict__ | {"_live": OrderedDict()}
+        return SceneCache, (self.scenes, self.memory_mb)
 
     @property
     def size_in_bytes(self) -> int:
@@ -32,10 +34,11 @@ class SceneCache:
     def get(self, episode: int, camera: str) -> LiveScene:
         """The scene of one camera of an episode, loaded if need be."""
         place = (episode, camera)
-        if place not in self._live:
-            scene = self.scenes[episode][camera]
-            self._live[place] = LiveScene(load(scene) if isinstance(scene, Path) else scene)
-            while len(self._live) > 1 and self.size_in_bytes > self.memory_mb * MEGABYTE:
-                self._live.popitem(last=False)
-        self._live.move_to_end(place)
-        return self._live[place]
+        with self._turn:
+            if place not in self._live:
+                scene = self.scenes[episode][camera]
+                self._live[place] = LiveScene(load(scene) if isinstance(scene, Path) else scene)
+                while len(self._live) > 1 and self.size_in_bytes > self.memory_mb * MEGABYTE:
+                    self._live.popitem(last=False)
+            self._live.move_to_end(place)
+            return self._live[place]

@@ -87,7 +87,7 @@ def test_dry_run_writes_nothing(desk: Path, tmp_path: Path, capsys: pytest.Captu
     assert "reads  3 episodes, 36 frames, of local/desk" in printed
     assert f"writes 9 episodes, 108 frames, to {tmp_path / 'new'}" in printed
     assert "for each that is read: the recorded one and 2 new; 144 new pictures" in printed
-    assert re.search(r"time +\d+ to \d+ (seconds|minutes) on this machine by one process", printed)
+    assert re.search(r"time +[\d.]+ to [\d.]+ (seconds|minutes) on this machine by one process", printed)
     assert re.search(r"disk +\d+\.\d to \d+\.\d MB", printed)
     assert list(tmp_path.iterdir()) == []
 

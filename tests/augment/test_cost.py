@@ -67,9 +67,15 @@ def test_disk_is_that_of_the_new_videos(desk: Path) -> None:
     bytes_of_front = sum(path.stat().st_size for path in (desk / "videos" / front).rglob("*.mp4"))
     speeds = Speeds(1.0, 2.0, 3.0, 4.0, video_bytes=5000.0, videos=(front,))
     assert bytes_of_front > 0
-    expected = predicted_output_bytes(source, [0, 1, 2], recipe) - 2 * bytes_of_front + 2 * 36 * 5000
-    reports = predicted_bytes(speeds, source, [0, 1, 2], recipe) - expected
+    expected = predicted_output_bytes(source, [0, 1, 2], [0, 1, 2], recipe) - 2 * bytes_of_front + 2 * 36 * 5000
+    reports = predicted_bytes(speeds, source, [0, 1, 2], [0, 1, 2], recipe) - expected
     assert reports == pytest.approx(6 * cost.REPORT_BYTES)
+    fewer = predicted_bytes(speeds, source, [0, 1, 2], [1], recipe) - 2 * (12 * 5000 + cost.REPORT_BYTES)
+    assert fewer == pytest.approx(
+        predicted_output_bytes(source, [0, 1, 2], [], recipe)
+        + predicted_output_bytes(source, [], [1], recipe)
+        - 2 * bytes_of_front / 3
+    )
 
 
 def test_saved_scenes_need_disk(desk: Path) -> None:

@@ -141,7 +141,7 @@ def test_settings_reach_a_worker_as_plain_values(desk: Path, tmp_path: Path, plu
     config = parse_config(AugmentConfig, [*flags, "--perturbation.metres", "2"], augment.ALIASES, command="")
     source = open_source("local/desk", desk)
     work = workers.Work(
-        source, ["front"], config, OutputDataset(source, "local/new", tmp_path / "new"), lambda *_: None
+        source, frozenset({0}), ["front"], config, OutputDataset(source, "local/new", tmp_path / "new"), lambda *_: None
     )
     sent = pickle.dumps(workers._place_of(work))
     assert plugins.PREFIX.encode() not in sent

@@ -84,6 +84,20 @@ def test_any_number_of_tasks_makes_the_same(desk: Path, one: Path, tmp_path: Pat
     assert "3 of 3 episodes" in read_json(f"{made.logs}/{RESULT}")["text"]
 
 
+@pytest.mark.parametrize("include", ["true", "false"])
+def test_tasks_choose_the_episodes_that_one_machine_chooses(desk: Path, tmp_path: Path, include: str) -> None:
+    some = ("--episodes_share=0.6", f"--include_source={include}")
+    flags = [*QUICK, ALONE, *some, f"--root={desk}", f"--new_root={tmp_path / 'one'}", "--workers=1"]
+    assert augment.run(flags) == 0
+    made = job(desk, tmp_path / "new", "--tasks=2", *some)
+    stages.background(made)
+    assert unfinished_ranks(made) == [0, 1]
+    work_on(made, [0, 1])
+    assert unfinished_ranks(made) == []
+    stages.merge(made)
+    assert_same(tmp_path / "one", tmp_path / "new")
+
+
 def test_a_killed_task_goes_on_where_it_was(
     desk: Path, one: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

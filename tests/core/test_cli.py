@@ -36,6 +36,31 @@ sys.stderr.write(os.environ["OMP_WAIT_POLICY"] + "\\n")
     assert in_a_new_process(code.replace("sys.stderr", "sys.stdout")).endswith("PASSIVE\n")
 
 
+@pytest.mark.parametrize(
+    ("command", "arguments"),
+    [
+        ("augment.__main__", ["--varants", "2"]),
+        ("augment.__main__", ["--repo", "local/absent"]),
+        ("augment.__main__", ["--repo", "local/absent", "--root", "absent"]),
+        ("cluster.__main__", ["--repo", "local/absent"]),
+        ("priors.__main__", ["--repo", "local/absent", "--out", "out"]),
+        ("viewer", ["--repo", "local/absent"]),
+        ("calibrate", ["--repo", "local/absent"]),
+        ("split", ["--repo", "local/absent"]),
+        ("carry", ["--root", "absent", "--sources", "[absent]"]),
+    ],
+)
+def test_what_is_mistyped_is_answered_before_anything_slow_is_imported(command: str, arguments: list[str]) -> None:
+    code = f"""
+import lerobot_msdyn.{command} as command
+sys.argv = ["command", *{arguments}]
+try: command.main()
+except SystemExit as end: assert end.code == 2, end.code
+print(sorted({{"torch", "lerobot", "cv2", "numba"}} & set(sys.modules)))
+"""
+    assert in_a_new_process(code) == "[]\n"
+
+
 def test_a_command_leaves_the_user_s_own_setting() -> None:
     code = """
 os.environ["OMP_WAIT_POLICY"] = "ACTIVE"

@@ -226,6 +226,7 @@ def test_every_number_has_a_range_and_a_default_inside_it(kind: Any) -> None:
         ("SplitConfig", ["--eval_split", ".nan"], "eval_split is nan"),
         ("ViewerConfig", ["--episode", "-1"], "episode is -1; expected a value from 0"),
         ("HeldoutCameraConfig", ["--episode", "-1"], "episode is -1"),
+        ("AugmentConfig", ["--episodes_share", "0"], "episodes_share is 0.0; expected a value from 0.001 to 1.0"),
         ("MixedViewsConfig", ["--probability", "1.5"], "probability is 1.5; expected a value from 0 to 1"),
         ("PriorsCommandConfig", ["--columns", "0"], "columns is 0"),
     ],

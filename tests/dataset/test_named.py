@@ -5,10 +5,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from huggingface_hub import HfApi
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
 from lerobot_msdyn.core.errors import DatasetError
-from lerobot_msdyn.dataset import named, read
+from lerobot_msdyn.dataset import read
 from lerobot_msdyn.dataset.named import check_named, lerobot_home
 from lerobot_msdyn.dataset.read import open_source
 
@@ -23,7 +24,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     def unreachable(self: object, repo_id: str, timeout: float) -> None:
         raise ConnectionError
 
-    monkeypatch.setattr(named.HfApi, "dataset_info", unreachable)
+    monkeypatch.setattr(HfApi, "dataset_info", unreachable)
     return tmp_path
 
 

@@ -25,7 +25,7 @@ def made_up(
         raise EpisodeError(f"{source.repo_id} episode {index}: cannot be read")
     new = [NewEpisode(index, Provenance(source.repo_id, index, SOURCE_VARIANT, recipe.seed))]
     account = Account(MovingPixels(90, 5, 5, 0), 0.01, 0.02, held_out=False).entry()
-    for variant in range(recipe.variants):
+    for variant in range(recipe.variants if cameras else 0):
         provenance = Provenance(
             source.repo_id,
             index,

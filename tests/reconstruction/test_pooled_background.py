@@ -16,6 +16,9 @@ from lerobot_msdyn.reconstruction.pooled_background import (
     as_arrays,
     colour_match,
     completed,
+    continued,
+    differing,
+    exchanged,
     from_arrays,
     pooled,
     same_places,
@@ -139,6 +142,41 @@ def test_an_episode_keeps_its_own_gaussians_where_its_background_is_another() ->
     mine = (mixed == fresh.means.reshape(HEIGHT, WIDTH, 3)).all(-1)
     assert mine[20:28, 4:12].all()
     assert mine.sum() <= 12 * 12
+
+
+def test_a_later_window_shows_what_the_first_one_does_but_where_it_differs() -> None:
+    """Shadows and exposure are left to the brightness over time; another surface, and what was hidden, are its own."""
+    wall = texture()
+    depth, seen = torch.full((HEIGHT, WIDTH), 2.0), torch.full((HEIGHT, WIDTH), 60)
+    hidden = seen.clone()
+    hidden[:4, :4] = 0
+    first = EmptyScene(torch.from_numpy(wall), depth, hidden)
+    darker = torch.from_numpy((0.95 * wall).astype(np.uint8))
+    other = darker.clone()
+    other[20:28, 4:12] = 255
+    own = EmptyScene(other, depth, seen)
+    differs = differing(first, own)
+    assert differs[20:28, 4:12].all()
+    assert differs[:4, :4].all()
+    assert differs.sum() <= 12 * 12 + 6 * 6
+    whole = continued(first, own, differs)
+    assert torch.equal(whole.rgb[differs], own.rgb[differs])
+    assert torch.equal(whole.rgb[~differs], first.rgb[~differs])
+    assert (whole.seen == 60).all()
+
+
+def test_gaussians_are_exchanged_by_pixel() -> None:
+    view = episode(4, texture())
+    rgb, depth = torch.from_numpy(texture()), torch.full((HEIGHT, WIDTH), 2.0)
+    mine = background_gaussians(rgb, depth, view.camera, 10_000)
+    others = dataclasses.replace(mine, means=mine.means + 1)
+    where = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    where[3, 5] = True
+    found = exchanged(mine, others, where)
+    assert (found.means - mine.means).reshape(HEIGHT, WIDTH, 3)[3, 5].tolist() == [1, 1, 1]
+    assert int((found.means != mine.means).any(-1).sum()) == 1
+    with pytest.raises(ValueError, match="expected"):
+        exchanged(mine.select(slice(0, 7)), others, where)
 
 
 @pytest.mark.parametrize("shift", [0, 3])

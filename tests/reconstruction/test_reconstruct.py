@@ -130,6 +130,14 @@ def test_windows_whose_priors_differ_say_so(pushed: View, monkeypatch: pytest.Mo
     assert not found.metric
 
 
+def test_windows_show_the_same_where_nothing_moves(pushed: View) -> None:
+    settings = recipe(steps=30)
+    settings.fit.window_frames = 6
+    first, second = (window.scene for window in reconstruct(pushed, settings).windows)
+    assert (first.static.means == second.static.means).all(-1).float().mean() > 0.7
+    assert (first.static.sh == second.static.sh).flatten(1).all(-1).float().mean() > 0.7
+
+
 def test_a_long_video_is_fitted_in_windows(pushed: View) -> None:
     settings = recipe()
     settings.fit.window_frames = 5

@@ -7,7 +7,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from lerobot_msdyn.render import rasterize
-from lerobot_msdyn.render.cpu.threads import in_threads, threads
+from lerobot_msdyn.render.cpu.threads import begun, in_threads, threads
 
 
 @pytest.fixture
@@ -52,6 +52,31 @@ def test_two_python_threads_at_once(make_scene):
         thread.join(timeout=60)
         assert not thread.is_alive()
     assert failures == []
+
+
+def test_what_no_helper_has_begun_is_made_by_the_thread_that_asks():
+    go, by = threading.Event(), {}
+
+    def made(item):
+        by[item] = threading.current_thread()
+        if item == 0:
+            assert go.wait(60)
+        return 10 * item
+
+    first, second, third = begun(made, [0, 1, 2], 1)
+    assert (third(), second()) == (20, 10)
+    go.set()
+    assert first() == 0
+    assert by[1] is by[2] is threading.current_thread() is not by[0]
+
+
+def test_an_error_of_a_helper_is_raised_where_its_result_is_asked_for():
+    def failing(item):
+        raise ValueError(item)
+
+    (call,) = begun(failing, ["no"], 1)
+    with pytest.raises(ValueError, match="no"):
+        call()
 
 
 class _Renders(Dataset):

@@ -13,6 +13,7 @@ from lerobot_msdyn.core.errors import ConfigError, DatasetError, MsdynError
 from lerobot_msdyn.dataset import provenance
 from lerobot_msdyn.scene import store as saved
 from lerobot_msdyn.training import MixedViews
+from lerobot_msdyn.training import mixed as mixing
 from lerobot_msdyn.views.perturbations.jitter import Jitter
 from lerobot_msdyn.views.perturbations.orbit import Orbit
 
@@ -96,6 +97,15 @@ def test_a_sample_depends_on_seed_epoch_and_index(desk: Path, desk_scenes: Path)
     some = MixedViews(recorded(desk, episodes=[1]), desk_scenes, 1.0)
     mixed.set_epoch(0)
     assert torch.equal(some[2][FRONT], mixed[14][FRONT]), "by the index in the whole dataset"
+
+
+@pytest.mark.parametrize("helpers", [0, 1, 3])
+def test_a_batch_is_its_samples(desk: Path, desk_scenes: Path, helpers: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mixing, "_free_cores", lambda: helpers)
+    mixed = MixedViews(recorded(desk), desk_scenes, 0.5)
+    order = [30, 1, 13, 7, 20, -34, 16, 1]
+    for index, sample in zip(order, mixed.__getitems__(order), strict=True):
+        assert_same_but(sample, mixed[index], set())
 
 
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import ContextVar
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -52,8 +52,15 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max(1, (os.cpu_count() or 1) - 1), "rasterizer")
 
 
+@cache
+def _helpers(count: int) -> ThreadPoolExecutor:
+    """So many threads that work beside the calling one."""
+    return ThreadPoolExecutor(count, "helpers")
+
+
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_pool.cache_clear)  # a forked child has none of its parent's threads
+    for threads_of_parent in (_pool, _helpers):  # of which a forked child has none
+        os.register_at_fork(after_in_child=threads_of_parent.cache_clear)
 
 
 def run(kernel: Callable[..., None], items: int, *arguments: Any) -> None:
@@ -97,6 +104,18 @@ def in_threads[A, B](function: Callable[[A], B], items: Iterable[A]) -> Iterator
             for future in waiting:
                 future.cancel()
             torch.set_num_threads(before)
+
+
+def begun[A, B](function: Callable[[A], B], items: Iterable[A], helpers: int) -> list[Callable[[], B]]:
+    """Calls that each give what a function makes of an item; so many threads begin to work on them, in order.
+
+    What none has begun when it is asked for is made then, by the thread that asks: best from the last one on.
+    """
+
+    def result_of(item: A, future: Future[B]) -> B:
+        return function(item) if future.cancel() else future.result()
+
+    return [partial(result_of, item, _helpers(helpers).submit(function, item)) for item in items]
 
 
 def point_tickets(times: int, points: int) -> int:
