@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from onnx import TensorProto, checker, helper, save
+from onnx import TensorProto, ValueInfoProto, checker, helper, save
 from tiny_onnx import IR_VERSION, OPSET
 
 SIDE, MASK_SIDE = 64, 32  # px
@@ -48,7 +48,7 @@ def _decoder() -> tuple[list, list, list, list]:
     return nodes, taken, given, [quality]
 
 
-def _info(name: str, *shape: int | str):
+def _info(name: str, *shape: int | str) -> ValueInfoProto:
     return helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)
 
 
