@@ -25,7 +25,7 @@ from lerobot_msdyn.core.plugins import plugin_digests
 from lerobot_msdyn.core.registry import extending_packages
 from lerobot_msdyn.dataset.checks import place_problem
 from lerobot_msdyn.dataset.rows import data_files
-from lerobot_msdyn.priors.depth.onnx_spec import NETWORK_SUFFIX, SPEC_SUFFIX
+from lerobot_msdyn.priors.onnx_file import NETWORK_SUFFIX, SPEC_SUFFIX
 from lerobot_msdyn.render.devices import chosen_device
 
 LIBRARIES = ("lerobot_msdyn", "lerobot", "torch", "numpy", "opencv-python-headless", "av", "numba", "pyarrow")
@@ -103,16 +103,21 @@ def _without_folders(settings: Any) -> Any:
         return {key: _without_folders(value) for key, value in settings.items()}
     if isinstance(settings, list):
         return [_without_folders(value) for value in settings]
-    is_path = isinstance(settings, str) and Path(settings).is_absolute()
-    return Path(settings).name if is_path else settings
+    if not isinstance(settings, str):
+        return settings
+    name, colon, parameter = settings.rpartition(PARAMETER)
+    return f"{name}{colon}{Path(parameter).name}" if Path(parameter).is_absolute() else settings
 
 
 def _named_files(settings: Any) -> list[Path]:
-    """The files that settings name: calibrations, exchange files, weights, and a network's YAML beside it."""
+    """The files that settings name: calibrations, exchange files, weights, networks, and their YAML beside them."""
     if isinstance(settings, dict):
         return [path for value in settings.values() for path in _named_files(value)]
     if not isinstance(settings, str):
         return []
-    named = [Path(text) for text in (settings, settings.partition(PARAMETER)[2])]
+    parameter = settings.partition(PARAMETER)[2]
+    named = [Path(text) for text in (settings, parameter) if text]
     beside = [path.with_suffix(SPEC_SUFFIX) for path in named if path.suffix == NETWORK_SUFFIX]
-    return [path for path in [*named, *beside] if path.suffix != "" and path.is_file()]
+    patterns = f"*{NETWORK_SUFFIX}", f"*{SPEC_SUFFIX}"
+    inside = [path for folder in named[1:] for pattern in patterns for path in sorted(folder.glob(pattern))]
+    return [path for path in [*named, *beside, *inside] if path.suffix != "" and path.is_file()]

@@ -88,7 +88,7 @@ class PriorsConfig:
     # auto (recorded, else a learned model that is on this machine, else stereo, else plane), recorded, plane,
     # depth_anything, depth_anything_metric, onnx:FILE.onnx, stereo (two or more calibrated cameras), or an .npz file.
     depth: str = one_of(AUTO, (AUTO,), registry=DEPTH)
-    # auto (a learned model that is on this machine, else change), change, sam2, edgetam, or an .npz file.
+    # auto (a learned model that is on this machine, else change), change, sam2, edgetam, onnx:FOLDER, or an .npz file.
     masks: str = one_of(AUTO, (AUTO,), registry=MASKS)
     # auto (raft if its weights are on this machine, else flow), flow, raft, or an .npz file.
     tracks: str = one_of(AUTO, (AUTO,), registry=TRACKS)

@@ -15,7 +15,7 @@ def test_a_recipe_in_an_output_names_no_folder_of_the_user() -> None:
         root=Path("/home/ann/ds"),
         camera=CameraConfig(calibration=Path("/home/ann/rig.json")),
         robot=RobotConfig(urdf=Path("/home/ann/arm/arm.urdf")),
-        priors=PriorsConfig(depth="/home/ann/depth/{episode}.npz", cache="/home/ann/cache"),
+        priors=PriorsConfig(depth="/home/ann/depth/{episode}.npz", masks="onnx:/home/ann/sam", cache="/home/ann/cache"),
     )
     text = recipe_text(config)
     assert "ann" not in text
@@ -23,4 +23,5 @@ def test_a_recipe_in_an_output_names_no_folder_of_the_user() -> None:
     assert kept["camera"]["calibration"] == "rig.json"
     assert kept["robot"]["urdf"] == "arm.urdf"
     assert kept["priors"]["depth"] == "{episode}.npz"
+    assert kept["priors"]["masks"] == "onnx:sam"
     assert kept["fit"] == yaml.safe_load(recipe_text(Recipe()))["fit"]

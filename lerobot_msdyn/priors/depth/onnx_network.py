@@ -13,13 +13,12 @@ from torch import Tensor
 
 from lerobot_msdyn.core.errors import PriorError, first_line
 from lerobot_msdyn.priors.depth.onnx_spec import OnnxSpec
-from lerobot_msdyn.render.cpu.threads import threads
+from lerobot_msdyn.priors.onnx_file import load_session
 
 _COLOURS = 3
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 _DEPTH_NAMES = ("predicted_depth", "pred_depth", "depth")  # of outputs, where there are several
-_ERRORS_ONLY = 3  # of onnxruntime's levels of logging
-_GREY = 0.5  # of white: the border of a padded picture
+_GREY = 127.5  # the border of a padded picture
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ class OnnxNetwork:
             PriorError: it is no network that takes one picture.
         """
         self._file, self._spec = file, spec
-        self._session = _session(file, device)
+        self._session = load_session(file, device)
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         if len(inputs) != 1:
             raise PriorError(f"{file} takes {', '.join(each.name for each in inputs)}; expected one input, a picture")
@@ -133,12 +132,10 @@ class OnnxNetwork:
         """A frame as the network takes it."""
         smaller = place.width < frame.shape[1]
         size, how = (place.width, place.height), cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
-        spec = self._spec
-        image = np.full((self._height, self._width, _COLOURS), _GREY * spec.white, np.float32)
+        image = np.full((self._height, self._width, _COLOURS), _GREY, np.float32)
         inside = np.s_[place.top : place.top + place.height, place.left : place.left + place.width]
-        image[inside] = cv2.resize(frame, size, interpolation=how).astype(np.float32) * (spec.white / 255)
-        ordered = image[..., ::-1] if spec.channels == "bgr" else image
-        normal = (ordered - np.array(spec.mean, np.float32)) / np.array(spec.std, np.float32)
+        image[inside] = cv2.resize(frame, size, interpolation=how)
+        normal = self._spec.normal(image)
         arranged = normal if self._axes == "bhwc" else normal.transpose(2, 0, 1)
         leading = (None,) * (len(self._axes) - arranged.ndim)
         if self._type is np.uint8:
@@ -158,18 +155,3 @@ class OnnxNetwork:
                 f"{self._file} gives {self._output} of shape {list(output.shape)}; expected one value per pixel"
             )
         return output.reshape(inner).astype(np.float32)
-
-
-def _session(file: Path, device: str) -> Any:
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level = _ERRORS_ONLY
-    options.intra_op_num_threads = threads()
-    wanted = ["CUDAExecutionProvider"] if device == "cuda" else []
-    there = onnxruntime.get_available_providers()
-    providers = [name for name in (*wanted, "CPUExecutionProvider") if name in there]
-    try:
-        return onnxruntime.InferenceSession(str(file), options, providers=providers)
-    except Exception as error:  # onnxruntime's own kinds have no base but this
-        raise PriorError(f"{file} is no network that onnxruntime can load ({first_line(error)})") from error

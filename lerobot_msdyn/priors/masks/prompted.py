@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from lerobot_msdyn.core.errors import PriorError
+from lerobot_msdyn.priors.cache import digest_of
 from lerobot_msdyn.priors.hub import LocalModel
 from lerobot_msdyn.priors.masks.providers.change import Change
 from lerobot_msdyn.priors.masks.sam2 import sam2_masks
@@ -38,6 +39,6 @@ class PromptedMasks(MaskProvider):
         def compute() -> dict[str, np.ndarray]:
             return {"masks": sam2_masks(request.view.rgb, prompts, model, request.device).numpy()}
 
-        settings = {"model": model.name, "revision": model.revision}
+        settings = {"model": model.name, "revision": model.revision, "shown": digest_of(prompts)}
         arrays = request.cache.get("masks", "prompted", settings, compute)
         return Estimate(torch.from_numpy(arrays["masks"]), model=model)

@@ -8,13 +8,12 @@ from torch import Tensor
 
 from lerobot_msdyn.core.config import PriorsConfig
 from lerobot_msdyn.core.files import digest_of_file
-from lerobot_msdyn.core.observations import Model
 from lerobot_msdyn.priors.depth.metres import in_metres
 from lerobot_msdyn.priors.depth.onnx_network import OnnxNetwork
-from lerobot_msdyn.priors.depth.onnx_spec import NETWORK_SUFFIX, read_spec
+from lerobot_msdyn.priors.depth.onnx_spec import read_spec
 from lerobot_msdyn.priors.depth.predicted import predicted
 from lerobot_msdyn.priors.hub import demand_library
-from lerobot_msdyn.priors.models import UNKNOWN_LICENCE
+from lerobot_msdyn.priors.onnx_file import NETWORK_SUFFIX
 from lerobot_msdyn.priors.registry import DEPTH, Depth, DepthProvider, Estimate, Masks, Unusable
 from lerobot_msdyn.priors.request import Request
 
@@ -55,5 +54,4 @@ class Onnx(DepthProvider):
         settings = {"file": digest, "spec": vars(spec), "focal_px": float(intrinsics[0, 0]) if spec.focal_px else 0}
         values, elsewhere = predicted(request, "onnx", settings, predict)
         estimate = in_metres(request, instances, values, spec.kind, trusted=False, elsewhere=elsewhere)
-        model = Model(spec.model or self._file.name, spec.revision or digest, spec.licence or UNKNOWN_LICENCE)
-        return replace(estimate, how=f"read {told}; {estimate.how}", model=model)
+        return replace(estimate, how=f"read {told}; {estimate.how}", model=spec.origin(self._file.name, digest))
