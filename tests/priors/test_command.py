@@ -64,7 +64,7 @@ def test_its_files_can_be_given_back(desk: Path, tmp_path: Path) -> None:
     [
         ([], "--repo is missing"),
         (["--repo", "local/desk"], "--out is missing"),
-        (["--priors.masks", "sam3"], "priors.masks is 'sam3'; expected auto, change, edgetam, sam2 or a file FILE.npz"),
+        (["--priors.masks", "sam3"], "priors.masks is 'sam3'; expected auto, change, edgetam, onnx, sam2 or a file"),
         (
             ["--priors.depth", "lidar"],
             "priors.depth is 'lidar'; expected auto, depth_anything, ",
