@@ -111,7 +111,7 @@ def test_samples_in_training_are_seen_along_its_path(augmented: tuple[SyntheticS
 def test_what_stands_still_stays_in_frames_of_ply(augmented: tuple[SyntheticScene, Path], tmp_path: Path) -> None:
     _, out = augmented
     saved: SavedScene = store.load(store.list_scenes(out)[0][FRONT])
-    saved = dataclasses.replace(saved, windows=tuple(dataclasses.replace(part, overlay=None) for part in saved.windows))
+    saved = dataclasses.replace(saved, windows=tuple(part.without_patches() for part in saved.windows))
     first, last = (load_ply(path) for path in export_frames(saved, [0, 9], tmp_path))
     still = len(saved.windows[0].static)
     assert still > 1000
