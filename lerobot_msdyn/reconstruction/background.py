@@ -90,6 +90,8 @@ def _median_of(
 def fill_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     """Depth (m, 0 = unknown) with each unknown pixel taken from the nearest known one; all unknown: 1 m."""
     known = (depth > 0).numpy()
+    if known.all():
+        return depth
     if not known.any():
         return torch.ones_like(depth)
     return torch.from_numpy(depth.numpy().ravel()[nearest_of(known)])
