@@ -16,9 +16,8 @@ Time is the last axis of the image arrays. covis: 0 = never seen by the recorded
 """
 
 import json
-import os
+from collections import deque
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +29,7 @@ import torch
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.errors import ConfigError, OutputError
 from lerobot_msdyn.core.geometry import matrix_to_quaternion
+from lerobot_msdyn.render.cpu.threads import in_threads
 from lerobot_msdyn.synthetic import dataset
 from lerobot_msdyn.synthetic.raycast import mark_covisible
 from lerobot_msdyn.synthetic.scene import SyntheticScene, SyntheticView, pinhole
@@ -94,8 +94,7 @@ def covisibility(
                 2 if t == same else 1,
             )
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        list(pool.map(mark, range(len(frames))))
+    deque(in_threads(mark, range(len(frames))), maxlen=0)
     return covis
 
 

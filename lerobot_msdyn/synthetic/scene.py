@@ -1,9 +1,8 @@
 """A synthetic scene: what a camera sees of it, and where its surface points go."""
 
 import math
-import os
+from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,6 +13,7 @@ from torch import Tensor
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.core.geometry import project, transform_points
+from lerobot_msdyn.render.cpu.threads import in_threads
 from lerobot_msdyn.synthetic import desk
 from lerobot_msdyn.synthetic.choreography import Choreography, choreograph
 from lerobot_msdyn.synthetic.desk import Primitive
@@ -187,8 +187,8 @@ class SyntheticScene:
             raise ConfigError(
                 f"camera has {len(camera)} poses for {len(times)} frames of the synthetic scene; give one per frame"
             )
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            list(pool.map(lambda i: work(self.geometry[times[i]], pinhole(camera, i), i), range(len(times))))
+        each = in_threads(lambda i: work(self.geometry[times[i]], pinhole(camera, i), i), range(len(times)))
+        deque(each, maxlen=0)
 
 
 def pinhole(camera: CameraTrack, i: int) -> Pinhole:

@@ -1,7 +1,5 @@
 """Outlines of the links as a camera sees them, and how they move with the camera and the joints."""
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import cv2
@@ -10,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 from numpy import ndarray
 
+from lerobot_msdyn.render.cpu.threads import in_threads
 from lerobot_msdyn.robots.calibration.search import Pose
 from lerobot_msdyn.robots.description import Robot
 from lerobot_msdyn.robots.kernels import draw_triangles, project_vertices, trace_edges
@@ -104,8 +103,7 @@ class Posed:
             out = np.empty((width * height, 4))
             return out[: trace_edges(index, depth, self.robot.face_link, moving, out)].copy()
 
-        with ThreadPoolExecutor(os.cpu_count() or 1, "outlines") as pool:
-            parts = list(pool.map(traced, range(len(self))))
+        parts = list(in_threads(traced, range(len(self))))
         frames = np.concatenate([np.full(len(part), frame) for frame, part in enumerate(parts)])
         x, y, z, link = np.concatenate(parts).T
         focal = pose.focal * width

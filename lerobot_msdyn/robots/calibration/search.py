@@ -4,9 +4,7 @@ Masks hold more than the robot, and links may rest. So each pixel's course over 
 what does not move with the joints then weighs nothing.
 """
 
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -14,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 
+from lerobot_msdyn.render.cpu.threads import in_threads
 from lerobot_msdyn.robots.kernels import agreement, cover
 
 AZIMUTHS = 24
@@ -108,11 +107,10 @@ def search(
 
     found = _everywhere(stage(0))
     second, third = stage(1), stage(2)
-    with ThreadPoolExecutor(os.cpu_count() or 1, "cameras") as pool:
-        for agreement_of, count, steps, size in zip((second, second, third), TRIES, STEPS, STEP_SIZES, strict=True):
-            tried = partial(improved, agreement_of, steps=steps, size=size)
-            near = likely if agreement_of is third else ()
-            found = list(pool.map(tried, [*near, *(each.pose for each in _distinct(found, count))]))
+    for agreement_of, count, steps, size in zip((second, second, third), TRIES, STEPS, STEP_SIZES, strict=True):
+        tried = partial(improved, agreement_of, steps=steps, size=size)
+        near = likely if agreement_of is third else ()
+        found = list(in_threads(tried, [*near, *(each.pose for each in _distinct(found, count))]))
     return _distinct(found, len(found))
 
 
