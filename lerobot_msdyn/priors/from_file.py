@@ -63,7 +63,7 @@ class DepthFile(DepthProvider):
     pattern: str
 
     def estimate(self, request: Request, instances: Masks) -> Estimate[Depth]:
-        """Metric depth is taken at its word; other depth is aligned."""
+        """Metric depth is taken at its word, unless a ground is known; other depth is aligned."""
         content = request.exchange(self.pattern)
         if content.depth is None:
             raise PriorError(f"{self.setting}: {self.pattern} has no array `depth`; see docs/priors.md")

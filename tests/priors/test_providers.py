@@ -13,8 +13,9 @@ from huggingface_hub import constants
 from lerobot_msdyn.core.cameras import intrinsics_from_fov, static_camera
 from lerobot_msdyn.core.config import CameraConfig, PriorsConfig
 from lerobot_msdyn.core.errors import PriorError
-from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.core.observations import BodyTracks, RobotSeen, View
 from lerobot_msdyn.priors import Priors, estimate_priors
+from lerobot_msdyn.priors.depth.table_plane import ground_plane
 
 FRAMES = 12
 
@@ -150,6 +151,29 @@ def test_everything_from_an_exchange_file(view: View, tmp_path: Path) -> None:
     known = priors.depth > 0
     torch.testing.assert_close(priors.depth[known], view.depth[known], atol=1e-2, rtol=0)
     assert known.float().mean() > 0.9
+
+
+def test_metres_of_a_file_give_way_to_a_ground_that_is_known(view: View, tmp_path: Path) -> None:
+    down = torch.tensor(40.0).deg2rad()
+    right, ahead = torch.tensor([1.0, 0, 0]), torch.stack((torch.zeros(()), down.cos(), -down.sin()))
+    pose = torch.eye(4)
+    pose[:3] = torch.stack((right, torch.linalg.cross(ahead, right), ahead, torch.tensor([0.0, 0, 0.5])), dim=1)
+    camera = replace(view.camera, world_from_camera=pose.expand(FRAMES, 4, 4).contiguous(), origin="calibration")
+    ground = ground_plane(camera, 0.0)
+    bias = 1 + 0.03 * torch.linspace(0, 6.3, 96).sin()
+    file = exchange(tmp_path / "metres.npz", depth=(ground * bias).expand(FRAMES, -1, -1).numpy())
+    unmoved = torch.zeros(FRAMES, 72, 96)
+    nothing = BodyTracks(torch.zeros(0, FRAMES, 3), torch.zeros(0, FRAMES) > 0, torch.zeros(0).long())
+    above = replace(view, depth=None, camera=camera)
+    known = replace(above, robot=RobotSeen(unmoved, unmoved > 0, nothing, 0.0))
+    table = (ground < ground.max()).expand(FRAMES, -1, -1) & ~(estimate(above, depth=file).instances > 0)
+    off = []
+    for seen in (above, known):
+        priors = estimate(seen, depth=file)
+        off.append(float((priors.depth / ground - 1).abs()[table & (priors.depth > 0)].mean()))
+    assert 0.015 < off[0] < 0.025  # as it is in the file
+    assert off[1] < 0.002
+    assert "metric; scaled to plane" in priors.provenance["depth"]["why"]
 
 
 def test_what_a_file_lacks_is_named(view: View, tmp_path: Path) -> None:

@@ -19,7 +19,9 @@ from lerobot_msdyn.priors.depth.align import MAX_FACTOR, scale_alone, scale_and_
 MOST_FRAMES = 60  # that a median is taken over
 MARGIN_PX = 4.0  # of 320: about what moves
 SPECK_PX = 5.0  # of 320: what is smaller, and said to stand on the ground, does not
-NEAR_GROUND = 0.09  # share of inverse depth by which a network may be off and mean the ground
+NEAR_GROUND = (0.02, 0.09)  # share of inverse depth by which depth may be off and mean the ground, least and most
+SPREAD = 0.68  # quantile of the differences from the ground that stands for their standard deviation
+SPREADS = 3.0  # times how far it usually is from the ground that it agrees with, between these
 AGREES = 0.06  # the same, of those pixels that say how it is to be aligned
 FARTHEST_GROUND = 0.3  # share of the largest inverse depth of the ground, below which it is no evidence
 LEAST_GROUND = 0.15  # share of the pixels before that, that must agree
@@ -56,7 +58,7 @@ def fused(
     still = own if elsewhere is None else _median(torch.cat((own[None], elsewhere)))
     aligned_to = still if elsewhere is None else _median(elsewhere)  # the same for all episodes
     if known:
-        scale, shift = _to_ground(aligned_to, ground, shifted)
+        scale, shift, near = _to_ground(aligned_to, ground, shifted)
     elif shifted:
         scale, shift = scale_and_shift(aligned_to[None], ground[None])
     else:
@@ -68,7 +70,7 @@ def fused(
     moving = _not_behind_feet(depth, instances, standing)
     if known:
         farthest = torch.where(ground < ground.max(), ground, BEYOND_WALL * ground)
-        empty, moving = _above(empty, farthest.reciprocal()), torch.minimum(moving, farthest)
+        empty, moving = _above(empty, farthest.reciprocal(), near), torch.minimum(moving, farthest)
     return torch.where(instances > 0, moving, empty.reciprocal())
 
 
@@ -87,8 +89,11 @@ def _median(values: Float[Tensor, "m h w"]) -> Float[Tensor, "h w"]:
     return torch.where(torch.isfinite(values), values, torch.nan).nanmedian(dim=0).values
 
 
-def _to_ground(still: Float[Tensor, "h w"], ground: Float[Tensor, "h w"], shifted: bool) -> tuple[float, float]:
-    """Scale and shift of inverse depth at which most pixels lie on the ground; what stands on it is no part of it."""
+def _to_ground(still: Float[Tensor, "h w"], ground: Float[Tensor, "h w"], shifted: bool) -> tuple[float, float, float]:
+    """Scale and shift of inverse depth at which most pixels lie on the ground, and by what share these may be off.
+
+    What stands on it is no part of it.
+    """
     target = ground.reciprocal()
     usable = torch.isfinite(still) & (target > FARTHEST_GROUND * target.max()) & (still > 0)
     x, y = still[usable].double(), target[usable].double()
@@ -116,12 +121,14 @@ def _to_ground(still: Float[Tensor, "h w"], ground: Float[Tensor, "h w"], shifte
     columns = (x[inside], torch.ones_like(x[inside])) if shifted else (x[inside],)
     design = torch.stack(columns, dim=1) / y[inside][:, None]
     solution = torch.linalg.lstsq(design, torch.ones_like(design[:, :1])).solution[:, 0].tolist()
-    return solution[0], solution[1] if shifted else 0.0
+    scale, shift = solution[0], solution[1] if shifted else 0.0
+    spread = float(((scale * x[inside] + shift) / y[inside] - 1).abs().quantile(SPREAD))
+    return scale, shift, min(max(SPREADS * spread, NEAR_GROUND[0]), NEAR_GROUND[1])
 
 
-def _above(inverse: Float[Tensor, "h w"], ground: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """Inverse depth with that of the ground where it is about that or less."""
-    stands = (inverse > (1 + NEAR_GROUND) * ground).numpy().astype(np.uint8)
+def _above(inverse: Float[Tensor, "h w"], ground: Float[Tensor, "h w"], near: float) -> Float[Tensor, "h w"]:
+    """Inverse depth with that of the ground where it is more by no more than a share `near`, or less."""
+    stands = (inverse > (1 + near) * ground).numpy().astype(np.uint8)
     window = np.ones((max(1, round(scaled_px(SPECK_PX, inverse.shape[1]))),) * 2, np.uint8)
     for operation in (cv2.MORPH_OPEN, cv2.MORPH_CLOSE):
         stands = cv2.morphologyEx(stands, operation, window)

@@ -35,17 +35,18 @@ def in_metres(
         kind: `metric` (m), `scale` (lacks a factor) or `affine_disparity` (inverse depth that lacks a factor and a
             shift, larger = nearer).
         trusted: whether metres are true ones. Those of a network are those of an unknown focal length: a reference in
-            true metres corrects them where there is one.
+            true metres corrects them where there is one. What a known ground contradicts is corrected in any case.
         elsewhere: what was predicted of frames of all episodes of this camera.
 
     Raises:
         PriorError: the values cannot be aligned to the reference.
     """
-    if kind == METRIC and trusted:
-        z = torch.where(torch.isfinite(values), values, 0.0).clamp(min=0)
-        return _clean(z, True, "in metres")
     reference, origin = reference_depth(request, instances)
     true_metres = reference.traits.metric
+    ground_known = reference.ground is not None and true_metres and request.view.camera.is_static
+    if kind == METRIC and trusted and not ground_known:
+        z = torch.where(torch.isfinite(values), values, 0.0).clamp(min=0)
+        return _clean(z, True, "in metres")
     if kind == METRIC and not true_metres:
         return _clean(values, False, "in the network's own metres")
     how = f"scaled{' and shifted' if kind == AFFINE_DISPARITY else ''} to {origin.provider}"
