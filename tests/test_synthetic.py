@@ -260,8 +260,10 @@ def test_the_hand_takes_the_block(episode: int) -> None:
         torch.testing.assert_close(still, still[:1].expand_as(still), atol=1e-6, rtol=0)
         limbs = [p for p in scene.primitives if p.body == finger]
         skin = [transform_points(torch.from_numpy(p.body_from_primitive), sphere * torch.tensor(p.half)) for p in limbs]
-        outside = transform_points(block_from_finger, torch.cat(skin).expand(60, -1, 3)).abs() - torch.tensor(BLOCK_HALF)
-        gap = outside.amax(-1).amin(1)  # m, of the nearest point, per frame; less than 0: inside
+        own = transform_points(block_from_finger, torch.cat(skin).expand(60, -1, 3))
+        gap = (
+            (own.abs() - torch.tensor(BLOCK_HALF)).amax(-1).amin(1)
+        )  # m, of the nearest point, per frame; less than 0: inside
         assert gap.min() > -1e-4
         assert gap[held].max() < 0.001
         assert min(gap[0], gap[-1]) > 0.01

@@ -210,8 +210,8 @@ def make_scene(
 
     Kinds: "push" (the gripper pushes a block), "lid" (it opens a hinged lid), "sheet" (it bends a sheet), "hand" (a
     person's hand takes the block and puts it elsewhere), "spin" (a windmill turns), "static" (nothing moves), "all"
-    (the gripper pushes while lid and sheet move by themselves). The seed decides textures and clutter. `episode` varies starting places and motion at the same desk, so that the episodes of a dataset share
-    background and camera.
+    (the gripper pushes while lid and sheet move by themselves). The seed decides textures and clutter. `episode` varies
+    starting places and motion at the same desk, so that the episodes of a dataset share background and camera.
 
     Raises:
         ConfigError: unknown kind, or no frame.
