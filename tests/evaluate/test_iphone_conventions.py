@@ -45,6 +45,13 @@ def change(path: Path, **values: Any) -> dict[str, Any]:
     return content
 
 
+def bgra(path: Path) -> np.ndarray:
+    """A picture as OpenCV reads and writes it."""
+    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert picture is not None
+    return picture
+
+
 def pixels(read: IphoneSequence, points: torch.Tensor) -> torch.Tensor:
     """Where the first validation camera sees points [n, 3] of the world, px [n, 2]."""
     return project(transform_points(read.cameras.camera_from_world[0], points), read.cameras.intrinsics[0])[0]
@@ -124,7 +131,7 @@ def test_times_decide_the_order_and_the_fitted_picture(raw: Path) -> None:
 
 def test_colours_that_lidar_missed_are_not_black(raw: Path) -> None:
     path = raw / "rgb" / "2x" / "0_00003.png"
-    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    picture = bgra(path)
     whole = picture[..., 2::-1].copy()
     picture[10:13, 20:23] = 0
     cv2.imwrite(str(path), picture)
@@ -134,7 +141,7 @@ def test_colours_that_lidar_missed_are_not_black(raw: Path) -> None:
     assert (rgb[~hole] == whole[~hole]).all()
     assert (rgb[[11, 10], [20, 21]] == whole[[11, 9], [19, 21]]).all()  # of the nearest pixels, beside and above
     validation = raw / "rgb" / "2x" / f"{VAL[0]}.png"
-    picture = cv2.imread(str(validation), cv2.IMREAD_UNCHANGED)
+    picture = bgra(validation)
     picture[10:12, 20:23, 3] = 0
     cv2.imwrite(str(validation), picture)
     true = read_sequence(raw, "dycheck").true_picture(VAL[0])
