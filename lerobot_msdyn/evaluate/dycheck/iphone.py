@@ -153,7 +153,8 @@ def _recorded(picture: UInt8[ndarray, "h w c"]) -> UInt8[ndarray, "h w 3"]:
 
 def _split(root: Path, name: str) -> tuple[list[str], list[int]]:
     """Pictures and their times; those of camera 0 in the order of time."""
-    content = _json(root / "splits" / f"{name}.json") if (root / "splits").is_dir() else _own_split(root, name)
+    own = not (root / "splits").is_dir() and (root / "dataset.json").is_file()
+    content = _own_split(root, name) if own else _json(root / "splits" / f"{name}.json")
     try:
         names, times = [str(each) for each in content["frame_names"]], [int(each) for each in content["time_ids"]]
     except (KeyError, TypeError, ValueError) as error:
