@@ -1,10 +1,13 @@
-"""The five iPhone sequences that are scored in papers, by one protocol, beside published rows of the same protocol.
+"""DyCheck's iPhone sequences by one protocol and several recipes, beside published rows of the same protocol.
 
-    python benchmarks/dycheck.py --data FOLDER --protocol som --out outputs/dycheck [-- --fit.steps 75000 ...]
+    python benchmarks/dycheck.py --data FOLDER --protocol som --out OUT --recipes paper [-- --fit.steps 75000 ...]
+    python benchmarks/dycheck.py --data FOLDER --protocol som --out OUT --recipes paper balanced --table
 
-FOLDER holds apple, block, paper-windmill, spin and teddy. What stands behind `--` goes to every
-`python -m lerobot_msdyn.evaluate dycheck`. A sequence whose OUT/<name>/scores.json is there is not run again.
-Rows of the two protocols are never shown together: they differ in pictures, cameras and masks.
+The first fits and scores what FOLDER has, by one recipe, and prints its rows; the second prints those of all that is
+scored, and runs nothing. FOLDER holds any sequences; papers report apple, block, paper-windmill, spin and teddy. What
+stands behind `--` goes to every `python -m lerobot_msdyn.evaluate dycheck`. A sequence whose
+OUT/<recipe>/<sequence>/scores.json is there is not run again. Rows of the two protocols are never shown together: they
+differ in pictures, cameras and masks.
 """
 
 import argparse
@@ -34,6 +37,8 @@ PUBLISHED: dict[str, dict[str, tuple[float | None, ...]]] = {
     "dycheck": {"T-NeRF (DyCheck)": (17.07, None, None)},
 }
 
+Means = dict[str, dict[str, float]]  # what is scored (the fit, the recorded picture, ...) -> score -> value
+
 
 def main(arguments: list[str]) -> int:
     """Runs what is not there yet and prints the table."""
@@ -42,38 +47,68 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--data", type=Path, required=True, help="folder of the sequences")
     parser.add_argument("--out", type=Path, required=True, help="where pictures and scores go")
     parser.add_argument("--protocol", choices=sorted(PUBLISHED), default="som")
-    parser.add_argument("--sequences", nargs="+", default=SEQUENCES, help="others have no published mean")
+    parser.add_argument("--recipes", nargs="+", default=["paper"], help="names or files")
+    parser.add_argument("--sequences", nargs="+", help="default: those of --data with pictures that validate")
+    parser.add_argument("--table", action="store_true", help="run nothing; show what is scored")
     a = parser.parse_args(arguments[:split])
-    found = {name: scores_of(a.data / name, a.out / name, a.protocol, arguments[split + 1 :]) for name in a.sequences}
+    found: dict[str, dict[str, Means]] = {}
+    for recipe in a.recipes:
+        name = Path(recipe).stem
+        flags = ["--recipe", recipe, "--protocol", a.protocol, *arguments[split + 1 :]]
+        for sequence in a.sequences or sequences_in(a.data):
+            out = a.out / name / sequence
+            if not (a.table or (out / "scores.json").is_file()):
+                evaluate.run(["dycheck", "--root", str(a.data / sequence), "--out", str(out), *flags])
+            if (out / "scores.json").is_file():
+                found.setdefault(name, {})[sequence] = scores_of(out, a.protocol)
+    if not found:
+        raise ConfigError(f"{a.out}: has no scores of {', '.join(a.recipes)}; run without --table first")
     print(table(found, a.protocol))
     return 0
 
 
-def scores_of(root: Path, out: Path, protocol: str, flags: list[str]) -> dict[str, dict[str, float]]:
-    """Mean scores of one sequence, of the fit and of the unchanged picture; from an earlier run if there was one.
+def sequences_in(data: Path) -> list[str]:
+    """Names of the sequences that have pictures of cameras other than 0.
 
     Raises:
-        ConfigError: the earlier run was of the other protocol.
+        ConfigError: there is none.
+    """
+    names = sorted({path.parents[2].name for path in data.glob("*/rgb/[12]x/[1-9]*_*.png")})
+    if not names:
+        raise ConfigError(f"{data}: holds no sequence with pictures that validate (<sequence>/rgb/2x/1_00000.png)")
+    return names
+
+
+def scores_of(out: Path, protocol: str) -> Means:
+    """Mean scores of one sequence by an earlier run.
+
+    Raises:
+        ConfigError: that was of the other protocol.
     """
     path = out / "scores.json"
-    if not path.is_file():
-        evaluate.run(["dycheck", "--root", str(root), "--out", str(out), "--protocol", protocol, *flags])
     content = json.loads(path.read_text())
     if content["protocol"] != protocol:
         raise ConfigError(f"{path} is of protocol {content['protocol']}, not {protocol}; choose another --out")
     return content["mean"]
 
 
-def table(found: dict[str, dict[str, dict[str, float]]], protocol: str) -> str:
-    """A line per sequence and published mean; means only over all five."""
+def table(found: dict[str, dict[str, Means]], protocol: str) -> str:
+    """A line per recipe and sequence, and their mean; published means beside it if that is of the five of papers."""
+    rows: dict[str, dict[str, dict[str, float]]] = {}
+    for recipe, of_sequences in found.items():
+        for sequence, means in of_sequences.items():
+            for kind, scores in means.items():
+                rows.setdefault(kind.replace("this fit", recipe), {})[sequence] = scores
     lines = [f"| protocol {protocol} | mPSNR | mSSIM | mLPIPS |", "|---|---|---|---|"]
-    for kind in dict.fromkeys(kind for means in found.values() for kind in means):
-        rows = [[means[kind].get(score) for score in SCORES] for means in found.values()]
-        lines += [_line(f"{kind}, {name}", row) for name, row in zip(found, rows, strict=True)]
-        if set(found) == set(SEQUENCES):
-            columns = list(zip(*rows, strict=True))
-            lines.append(_line(f"{kind}, mean", [None if None in column else np.mean(column) for column in columns]))
-    return "\n".join([*lines, *(_line(f"published: {name}", row, 2) for name, row in PUBLISHED[protocol].items())])
+    for label, scored in rows.items():
+        values = {name: [scores.get(score) for score in SCORES] for name, scores in scored.items()}
+        lines += [_line(f"{label}, {name}", row) for name, row in values.items()]
+        five = set(SEQUENCES) <= set(values)
+        columns = list(zip(*(values[name] for name in (SEQUENCES if five else values)), strict=True))
+        mean = [None if None in column else float(np.mean(column)) for column in columns]
+        lines.append(_line(f"{label}, mean of {'the five' if five else len(values)}", mean))
+    published = PUBLISHED[protocol] if all(set(SEQUENCES) <= set(each) for each in found.values()) else {}
+    return "\n".join([*lines, *(_line(f"published: {name}", row, 2) for name, row in published.items())])
 
 
 def _line(name: str, row: list[float | None] | tuple[float | None, ...], digits: int = 3) -> str:

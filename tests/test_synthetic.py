@@ -22,6 +22,7 @@ from lerobot_msdyn.synthetic import (
     write_nvs_folder,
 )
 from lerobot_msdyn.synthetic.__main__ import run
+from lerobot_msdyn.synthetic.choreography import BLOCK_HALF
 from lerobot_msdyn.synthetic.intersect import BOX, CYLINDER, ELLIPSOID, SHEET, Geometry, hit
 from lerobot_msdyn.synthetic.raycast import Appearance, Pinhole, see_points, trace_color, trace_surface
 
@@ -158,6 +159,8 @@ def test_episodes_share_the_desk_but_not_the_motion() -> None:
         ("lid", ("background", "robot", "lid")),
         ("sheet", ("background", "robot", "sheet")),
         ("all", ("background", "robot", "block", "lid", "sheet")),
+        ("hand", ("background", "block", "hand")),
+        ("spin", ("background", "windmill")),
     ],
 )
 def test_instances_are_what_moves(kind: str, names: tuple[str, ...]) -> None:
@@ -237,6 +240,46 @@ def test_tracks_of_a_body_move_with_it(everything: SyntheticScene) -> None:
     apart = torch.cdist(shape, shape, compute_mode="donot_use_mm_for_euclid_dist")
     assert (apart - apart[:1]).abs().max() > 0.02  # it bends
     assert (apart <= apart[0] + 1e-5).all()  # and never stretches: it lies flat in the first frame
+
+
+@pytest.mark.parametrize("episode", range(8))
+def test_the_hand_takes_the_block(episode: int) -> None:
+    """Its fingers close on it, touch its sides without going into them, and stay with it as long as it moves."""
+    scene = make_scene("hand", 0, 60, WIDTH, HEIGHT, episode=episode)
+    poses = dict(zip(scene.body_names, scene.world_from_body.double(), strict=True))
+    block = poses["block"]
+    moving = ((block[1:] - block[:-1]).abs().amax((1, 2)) > 1e-6).nonzero()[:, 0]
+    held = slice(int(moving[0]), int(moving[-1]) + 2)
+    assert block[held, 2, 3].max() > 0.06
+    assert (block[-1, :2, 3] - block[0, :2, 3]).norm() > 0.12
+    sphere = torch.randn(4000, 3, generator=torch.Generator().manual_seed(0)).double()
+    sphere /= sphere.norm(dim=-1, keepdim=True)
+    for finger in ("thumb", "index", "middle", "ring"):
+        block_from_finger = invert_se3(block) @ poses[finger]
+        still = block_from_finger[held]
+        torch.testing.assert_close(still, still[:1].expand_as(still), atol=1e-6, rtol=0)
+        limbs = [p for p in scene.primitives if p.body == finger]
+        skin = [transform_points(torch.from_numpy(p.body_from_primitive), sphere * torch.tensor(p.half)) for p in limbs]
+        own = transform_points(block_from_finger, torch.cat(skin).expand(60, -1, 3))
+        gap = (
+            (own.abs() - torch.tensor(BLOCK_HALF)).amax(-1).amin(1)
+        )  # m, of the nearest point, per frame; less than 0: inside
+        assert gap.min() > -1e-4
+        assert gap[held].max() < 0.001
+        assert min(gap[0], gap[-1]) > 0.01
+
+
+@pytest.mark.parametrize("episode", range(4))
+def test_the_windmill_turns_about_its_hub(episode: int) -> None:
+    scene = make_scene("spin", 0, 48, WIDTH, HEIGHT, episode=episode)
+    rotor = scene.world_from_body[scene.body_names.index("rotor")].double()
+    assert (rotor[:, :3, 3] == rotor[0, :3, 3]).all()
+    axes = rotor[:, :3, 1]
+    torch.testing.assert_close(axes, axes[:1].expand_as(axes), atol=1e-6, rtol=0)
+    steps = (rotor[:-1, :3, 0] * rotor[1:, :3, 0]).sum(-1).clamp(-1, 1).acos()
+    assert steps.sum() >= 2 * math.pi  # once round at least
+    assert steps.max() < math.radians(22)  # so that a vane is not taken for the next
+    assert axes[0, 1] > 0.8  # it faces the camera
 
 
 @pytest.mark.parametrize("kind", ["push", "lid", "sheet"])

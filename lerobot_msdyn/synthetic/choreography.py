@@ -1,7 +1,7 @@
-"""What moves in each kind of scene: the gripper's path, what it touches, and the arm that follows.
+"""What moves in each kind of scene: the gripper's path, what it touches, and the arm that follows; or a person's hand.
 
 World frame: z up, the table top is z = 0, x to the right and y away from the recorded camera. The gripper's frame
-has its origin between the finger tips, z towards the palm and x across the opening.
+has its origin between the finger tips, z towards the palm and x across the opening; so has the hand's.
 """
 
 import math
@@ -13,7 +13,7 @@ import numpy as np
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.synthetic.rigid import from_axes, pose
 
-KINDS = ("push", "lid", "sheet", "static", "all")
+KINDS = ("push", "lid", "sheet", "hand", "spin", "static", "all")
 STATE_NAMES = ("gripper.x", "gripper.y", "gripper.z", "gripper.yaw", "gripper.pitch", "gripper.opening")
 
 SHOULDER = np.array([-0.24, 0.25, 0.13])
@@ -29,6 +29,11 @@ SHEET_SIZE = (0.20, 0.16)  # m, along (bends) and across
 SHEET_CORNER = np.array([0.262, -0.215, 0.0015])  # fixed end of the edge that is nearer to the camera
 SHEET_SEGMENTS = 36
 DOWEL_RADIUS = 0.006
+PARKED = np.array([-0.12, 0.21, 0.17, 0.0, 0.0, 0.03])  # state of an arm that is not used
+KNUCKLE = (0.036, 0.084)  # m, across and above the finger tips
+FINGER_GIRTH = 0.009  # m, half extent of a hand's fingers
+SPREAD = {"thumb": 0.0, "index": 0.023, "middle": 0.0, "ring": -0.022}  # m along the palm; the thumb is opposite
+HUB = np.array([-0.01, 0.075, 0.155])  # of the windmill
 
 
 @dataclass(frozen=True)
@@ -160,6 +165,54 @@ def _lift_sheet(time: np.ndarray, dowels: np.ndarray) -> np.ndarray:
     return states
 
 
+def _take(time: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """States [t, 6] of the hand (the last is what its fingers open by, rad) and block poses.
+
+    The hand closes on the block, carries it over the table in a bow, turns it, puts it down and goes.
+    """
+    way = ease(time, 0.30, 0.72)
+    start, yaw = np.array([rng.uniform(-0.01, 0.02), rng.uniform(-0.13, -0.10)]), rng.uniform(-0.2, 0.3)
+    goal = np.array([rng.uniform(-0.15, -0.13), rng.uniform(-0.03, 0.0)])
+    block = np.zeros((len(time), 6))
+    block[:, :2] = start + way[:, None] * (goal - start)
+    block[:, 2] = BLOCK_HALF[2] + rng.uniform(0.05, 0.07) * np.sin(np.pi * way) ** 2
+    block[:, 3] = yaw - rng.uniform(0.6, 1.0) * way
+    block[:, 4] = rng.uniform(0.2, 0.35) * np.sin(np.pi * way) ** 2
+    first, last = block[0], block[-1]
+    states = _through(time, [(0.0, _aside(first, 0.09)), (0.20, _aside(first, 0.0)), (0.28, first)]) + block - first
+    states += _through(time, [(0.74, last), (0.82, _aside(last, 0.0)), (1.0, _aside(last, 0.07))]) - last
+    return states, np.stack([gripper_pose(state) for state in block])
+
+
+def _aside(hold: np.ndarray, metres: float) -> np.ndarray:
+    """The hand open, and so far up, and towards the person."""
+    return _at(hold, y=hold[1] + 0.6 * metres, z=hold[2] + metres, opening=0.5)
+
+
+def _hand_poses(states: np.ndarray) -> dict[str, np.ndarray]:
+    """Poses [t, 4, 4] of the palm (with the forearm) and of rigid fingers that turn about their knuckles.
+
+    The fingers close across the y axis of a state's pose.
+    """
+    across, above = KNUCKLE
+    poses = {"palm": np.stack([gripper_pose(state) @ pose((0, 0, 0), yaw=-math.pi / 2) for state in states])}
+    for name, along in SPREAD.items():
+        side = -1 if name == "thumb" else 1
+        knuckle = [pose((side * across, along, above), roll=-side * state[5]) for state in states]
+        poses[name] = poses["palm"] @ np.stack(knuckle)
+    return poses
+
+
+def _windmill_poses(time: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Poses [t, 4, 4] of its stand and of its rotor, which gathers way and turns once or more about its y axis."""
+    turned = 2 * math.pi * rng.uniform(1.0, 1.5) * time**2 * (3 - time) / 2
+    axle = pose(HUB, yaw=rng.uniform(-0.3, 0.3), pitch=-0.2)
+    return {
+        "stand": np.broadcast_to(np.eye(4), (len(time), 4, 4)),
+        "rotor": np.stack([axle @ pose((0, 0, 0), roll=angle) for angle in turned]),
+    }
+
+
 def arm_poses(states: np.ndarray) -> dict[str, np.ndarray]:
     """Poses [t, 4, 4] of the arm's bodies for gripper states (two equal links, elbow up).
 
@@ -210,8 +263,14 @@ def choreograph(kind: str, frames: int, rng: np.random.Generator) -> Choreograph
     nodes, dowels = _bend_sheet(time if kind in ("sheet", "all") else rest, rng)
     states = {"push": push_states, "all": push_states, "lid": lid_states, "static": push_states}.get(kind)
     if states is None:
-        states = _lift_sheet(time, dowels)
+        states = _lift_sheet(time, dowels) if kind == "sheet" else np.tile(PARKED, (frames, 1))
+    visitor: dict[str, np.ndarray] = {}
+    if kind == "hand":
+        hand, blocks = _take(time, rng)
+        visitor = _hand_poses(hand)
+    elif kind == "spin":
+        visitor = _windmill_poses(time, rng)
     still = np.broadcast_to(np.eye(4), (frames, 4, 4))
-    bodies = {"block": blocks, "lid": _lid_poses(angle), "dowel": dowels}
+    bodies = {"block": blocks, "lid": _lid_poses(angle), "dowel": dowels, **visitor}
     poses = {"world": still, **arm_poses(states), **bodies}
     return Choreography(states, poses, nodes, np.array([0.0, SHEET_SIZE[1], 0.0]))

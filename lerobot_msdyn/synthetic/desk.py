@@ -7,7 +7,7 @@ import numpy as np
 from lerobot_msdyn.synthetic import choreography as ch
 from lerobot_msdyn.synthetic import textures as paint
 from lerobot_msdyn.synthetic.intersect import BOX, CYLINDER, ELLIPSOID, SHEET
-from lerobot_msdyn.synthetic.rigid import Triple, pose
+from lerobot_msdyn.synthetic.rigid import Triple, from_axes, pose
 from lerobot_msdyn.synthetic.textures import Texture
 
 
@@ -190,10 +190,53 @@ def _clutter(rng: np.random.Generator) -> list[Primitive]:
     return out
 
 
+def _between(start: Triple, stop: Triple, girth: float, texture: str, body: str) -> Primitive:
+    """A limb: an ellipsoid whose long axis goes from one place of a body to another."""
+    a, b = np.array(start, float), np.array(stop, float)
+    along = (b - a) / np.linalg.norm(b - a)
+    side = np.cross((0.0, 1.0, 0.0), along)
+    side /= np.linalg.norm(side)
+    placed = from_axes(side, np.cross(along, side), along, (a + b) / 2)
+    half = (girth, girth, float(np.linalg.norm(b - a)) / 2)
+    return Primitive(ELLIPSOID, half, texture, texture, body, placed)
+
+
+def _hand() -> list[Primitive]:
+    """A palm with a sleeve towards the person, and fingers of two limbs; each finger's frame lies on its knuckle."""
+    across, above = ch.KNUCKLE
+    girth = ch.FINGER_GIRTH
+    tip = ch.BLOCK_HALF[1] + girth - across  # from the knuckle, outwards
+    palm = Primitive(ELLIPSOID, (0.047, 0.040, 0.017), "skin", "skin", "palm", pose((0.0, 0.0, above + 0.004)))
+    arm = [
+        _between((0.0, 0.0, above), (-0.10, 0.03, above + 0.05), 0.026, "skin", "palm"),
+        _between((-0.06, 0.02, above + 0.03), (-0.42, 0.12, above + 0.20), 0.040, "sleeve", "palm"),
+    ]
+    fingers = []
+    for name in ch.SPREAD:
+        out = (-1 if name == "thumb" else 1) * tip
+        fingers.append(_between((0.0, 0.0, 0.008), (3.5 * out, 0.0, -0.45 * above), girth, "skin", name))
+        fingers.append(_between((out, 0.0, -0.36 * above), (out, 0.0, 0.02 - 1.2 * above), girth, "skin", name))
+    return [palm, *arm, *fingers]
+
+
+def _windmill() -> list[Primitive]:
+    """A post on a foot, and four vanes of different print, twisted about their arms."""
+    x, y, z = ch.HUB
+    parts = [
+        _cylinder(pose((x, y + 0.022, 0.005)), 0.035, 0.010, "motor", body="stand"),
+        _cylinder(pose((x, y + 0.022, z / 2)), 0.005, z, "dowel", body="stand"),
+        _cylinder(pose((0, 0.008, 0), pitch=np.pi / 2), 0.010, 0.034, "motor", body="rotor", gloss=0.2),
+    ]
+    for k, name in enumerate(("sheet", "checks", "cereal", "lid")):
+        arm = pose((0, 0, 0), roll=k * np.pi / 2) @ pose((0.058, 0, 0.014)) @ pose((0, 0, 0), pitch=0.45)
+        parts.append(Primitive(BOX, (0.050, 0.0015, 0.028), name, name, "rotor", arm))
+    return parts
+
+
 def primitives(rng: np.random.Generator) -> list[Primitive]:
-    """Everything in the room."""
+    """Everything that can be in the room."""
     block = Primitive(BOX, ch.BLOCK_HALF, "block_side", "block", body="block", gloss=0.05)
-    return [*_room(), *_robot(), *_container(), *_sheet(), block, *_clutter(rng)]
+    return [*_room(), *_robot(), *_container(), *_sheet(), block, *_clutter(rng), *_hand(), *_windmill()]
 
 
 def painted(rng: np.random.Generator) -> dict[str, Texture]:
@@ -239,4 +282,6 @@ def painted(rng: np.random.Generator) -> dict[str, Texture]:
             f"book_{k}_cover": paint.label(rng, word, (accents[i], cream, dark), (0.16, 0.12))
             for i, (k, word) in enumerate(zip("abc", ("OPTICS", "CONTROL", "POEMS"), strict=True))
         },
+        "skin": paint.plain(rng, (214, 164, 136), amount=0.08, extent=0.06),
+        "sleeve": paint.checks(rng, (accents[1], cream), 0.02),
     }

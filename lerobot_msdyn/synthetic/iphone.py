@@ -17,11 +17,11 @@ import torch
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.errors import ConfigError, OutputError
-from lerobot_msdyn.core.geometry import matrix_to_quaternion
+from lerobot_msdyn.core.geometry import matrix_to_quaternion, transform_points, unproject_image
 from lerobot_msdyn.synthetic.nvs import covisibility
 from lerobot_msdyn.synthetic.rough_depth import rough_depth
 from lerobot_msdyn.synthetic.scene import SyntheticScene, SyntheticView
-from lerobot_msdyn.synthetic.viewpoints import hand_held_camera, heldout_cameras
+from lerobot_msdyn.synthetic.viewpoints import TARGET, hand_held_camera, heldout_cameras
 
 VALIDATION = ("az+10", "el+08")  # the held-out cameras that become cameras 1, 2, ...
 UNIT_M = 0.5  # m per unit of Shape of Motion's cameras
@@ -65,7 +65,7 @@ def write_iphone_folder(
             "camera_ids": [sight.number for sight in in_split for _ in sight.frames],
         }
         _write_json(root / "splits" / f"{split}.json", content)
-    _write_json(root / "extra.json", {"factor": 2, "fps": scene.fps})
+    _write_descriptions(scene, sights, root)
 
 
 @dataclass(frozen=True)
@@ -106,6 +106,38 @@ def _write_pictures(scene: SyntheticScene, sights: list[Sight], root: Path, fact
     _write_arrays(root / "depth" / size, sights[0].names, recorded.depth.numpy()[..., None])
     if factor == 1:
         _write_priors(scene, recorded, sights[0].names, root / PROCESSED)
+
+
+def _write_descriptions(scene: SyntheticScene, sights: list[Sight], root: Path) -> None:
+    """dataset.json, metadata.json, scene.json and extra.json: which pictures there are, and a box of diagonal 1 (unit).
+
+    This package needs none of them; DyCheck's loader does. Lengths in extra.json, near and far are in that unit.
+    """
+    train, validation = ([name for sight in some for name in sight.names] for some in (sights[:1], sights[1:]))
+    content = {"count": len(train) + len(validation), "num_exemplars": len(train)}
+    ids = {"ids": train + validation, "train_ids": train, "val_ids": validation}
+    _write_json(root / "dataset.json", content | ids)
+    described = {
+        name: {"warp_id": frame, "appearance_id": frame, "camera_id": sight.number}
+        for sight in sights
+        for name, frame in zip(sight.names, sight.frames, strict=True)
+    }
+    _write_json(root / "metadata.json", described)
+    camera = sights[0].camera
+    depth = torch.from_numpy(scene.surface(camera).depth)
+    seen = torch.stack([unproject_image(z, k).reshape(-1, 3) for z, k in zip(depth, camera.intrinsics, strict=True)])
+    away = seen.norm(dim=-1).numpy()
+    places = camera.world_from_camera[:, :3, 3]
+    points = torch.cat((transform_points(camera.world_from_camera, seen).reshape(-1, 3), places)).double().numpy()
+    box = np.stack((points.min(0), points.max(0)))
+    center, scale = box.mean(0), float(1 / np.linalg.norm(box[1] - box[0]))
+    near, far = 0.75 * scale * np.quantile(away, 0.001), 1.25 * scale * np.quantile(away, 0.999)
+    _write_json(
+        root / "scene.json", {"scale": scale, "center": center.tolist(), "near": float(near), "far": float(far)}
+    )
+    up = -camera.world_from_camera[:, :3, 1].double().mean(0).numpy()
+    own = {"bbox": ((box - center) * scale).tolist(), "lookat": ((TARGET - center) * scale).tolist(), "up": up.tolist()}
+    _write_json(root / "extra.json", {"factor": 2, "fps": scene.fps, **own})
 
 
 def _write_priors(scene: SyntheticScene, recorded: SyntheticView, names: list[str], folder: Path) -> None:

@@ -27,6 +27,8 @@ OBJECTS = {  # instance -> its bodies, in the order of the instance ids
     "block": ("block",),
     "lid": ("lid",),
     "sheet": ("sheet", "dowel"),
+    "hand": ("palm", "thumb", "index", "middle", "ring"),
+    "windmill": ("rotor",),
 }
 MIP_LEVELS = 6
 LAMP, LAMP_RADIUS = (-0.75, -0.55, 1.25), 0.09  # m
@@ -206,20 +208,27 @@ def make_scene(
 ) -> SyntheticScene:
     """A desk with a robot arm; what moves depends on the kind.
 
-    Kinds: "push" (the gripper pushes a block), "lid" (it opens a hinged lid), "sheet" (it bends a sheet), "static"
-    (nothing moves), "all" (the gripper pushes while lid and sheet move by themselves). The seed decides textures and
-    clutter. `episode` varies starting places and motion at the same desk, so that the episodes of a dataset share
-    background and camera.
+    Kinds: "push" (the gripper pushes a block), "lid" (it opens a hinged lid), "sheet" (it bends a sheet), "hand" (a
+    person's hand takes the block and puts it elsewhere), "spin" (a windmill turns), "static" (nothing moves), "all"
+    (the gripper pushes while lid and sheet move by themselves). The seed decides textures and clutter. `episode` varies
+    starting places and motion at the same desk, so that the episodes of a dataset share background and camera.
 
     Raises:
         ConfigError: unknown kind, or no frame.
     """
     moves = choreograph(kind, frames, np.random.default_rng([seed, 1, episode]))
-    furniture = tuple(desk.primitives(np.random.default_rng([seed, 0])))
     poses = moves.poses | {"sheet": moves.poses["world"]}
+    furniture = tuple(p for p in desk.primitives(np.random.default_rng([seed, 0])) if p.body in poses)
     names = tuple(poses)
     instance_names, instance_of_body = _instances(names, moves)
-    tasks = {"push": "push the block", "lid": "open the tool box", "sheet": "lift the mat", "static": "wait"}
+    tasks = {
+        "push": "push the block",
+        "lid": "open the tool box",
+        "sheet": "lift the mat",
+        "hand": "wait for the block",
+        "spin": "wait",
+        "static": "wait",
+    }
     return SyntheticScene(
         kind=kind,
         seed=seed,
@@ -242,6 +251,8 @@ def _instances(bodies: tuple[str, ...], moves: Choreography) -> tuple[tuple[str,
     """Names by instance id and id per body; objects that stand still in the whole episode belong to 0."""
     names, ids = ["background"], np.zeros(len(bodies), np.int64)
     for name, parts in OBJECTS.items():
+        if not set(parts) <= set(bodies):
+            continue
         motions = [moves.sheet_nodes if part == "sheet" else moves.poses[part] for part in parts]
         if any((motion != motion[:1]).any() for motion in motions):
             ids[[bodies.index(part) for part in parts]] = len(names)

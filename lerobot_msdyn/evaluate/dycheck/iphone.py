@@ -3,13 +3,16 @@
 A sequence is a folder (Gao et al., "Monocular Dynamic View Synthesis: A Reality Check", NeurIPS 2022); pictures are
 named `<camera>_<time>`: camera 0 is held in the hand and fitted, the others stand still and validate.
 
-    camera/<id>.json                 orientation (rows: world to camera), position, focal_length and so on, at 1x
-    rgb/{1,2}x/<id>.png              RGBA; alpha is not used
+    camera/<id>.json                 orientation (rows: world to camera), position, focal_length and so on, at 1x;
+                                     pixel centres at half-integers
+    rgb/{1,2}x/<id>.png              RGBA; where LiDAR, which gives camera 0 its colours, has gaps: black, no alpha
     depth/{1,2}x/<id>.npy            [H, W, 1] z-depth of camera 0, m, 0 = unknown
     covisible/2x/val/<id>.png        255 where the training frames show a validation view
-    splits/{train,val}.json          frame_names, time_ids
+    splits/{train,val}.json          frame_names, time_ids; without the folder, from dataset.json and metadata.json
     flow3d_preprocessed/             Shape of Motion's: covisible/1x/val/, colmap/sparse/, colmap/scale.npy;
                                      optional: track_anything/, aligned_depth_anything_colmap/, 2d_tracks/, all at 1x
+
+The center and scale of scene.json, which bring a scene into a box of diagonal 1, are not applied: all stays in metres.
 """
 
 import json
@@ -18,7 +21,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -28,6 +31,7 @@ from numpy import ndarray
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.errors import DatasetError
+from lerobot_msdyn.core.images import nearest_of
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.evaluate.config import Protocol
 from lerobot_msdyn.priors.hub import demand_library
@@ -35,6 +39,16 @@ from lerobot_msdyn.priors.hub import demand_library
 FACTOR: dict[Protocol, int] = {"som": 1, "dycheck": 2}  # by which pictures are smaller than the recorded ones
 PROCESSED = "flow3d_preprocessed"
 MILLIMETRES_FROM = 100.0  # a median depth above this cannot be metres
+HALF = 127  # a mask's pixel, or alpha, above this says yes
+
+
+class _Cameras(NamedTuple):
+    """Of some pictures, as files have them."""
+
+    intrinsics: Float[ndarray, "n 3 3"]  # px at 1x
+    poses: Float[ndarray, "n 4 4"]  # world from camera, m
+    sizes: Float[ndarray, "n 2"]  # width and height at 1x, px
+    metres: float  # per unit of the files
 
 
 @dataclass(frozen=True)
@@ -80,10 +94,17 @@ def read_sequence(root: Path, protocol: Protocol) -> IphoneSequence:
     if not validation:
         raise DatasetError(f"{root}: splits/val.json names no picture: nothing to score (five sequences have some)")
     factor = FACTOR[protocol]
-    rgb = np.stack([read_picture(root / "rgb" / f"{factor}x" / f"{name}.png")[..., :3] for name in names])
+    rgb = np.stack([_recorded(read_picture(root / "rgb" / f"{factor}x" / f"{name}.png")) for name in names])
     height, width = rgb.shape[1:3]
     read = _colmap_cameras if protocol == "som" else _json_cameras
-    intrinsics, poses, metres = read(root, [*names, *validation])
+    intrinsics, poses, sizes, metres = read(root, [*names, *validation])
+    wrong = np.flatnonzero((np.abs(sizes - factor * np.array((width, height))) >= factor).any(1))
+    if len(wrong):
+        first, (full_width, full_height) = [*names, *validation][wrong[0]], sizes[wrong[0]]
+        raise DatasetError(
+            f"{root}: the camera of {first} is one of {full_width:.0f}x{full_height:.0f} px, pictures in "
+            f"rgb/{factor}x are {width}x{height}; expected them smaller by {factor}"
+        )
     intrinsics[:, :2] /= factor
     track = CameraTrack(
         torch.from_numpy(intrinsics).float(), torch.from_numpy(poses).float(), width, height, "exchange"
@@ -123,15 +144,38 @@ def read_array(path: Path) -> ndarray:
         raise DatasetError(f"{path}: cannot be read ({error}); expected a .npy file of numbers") from error
 
 
+def _recorded(picture: UInt8[ndarray, "h w c"]) -> UInt8[ndarray, "h w 3"]:
+    """Its colours; where alpha says that there is none, that of the nearest pixel."""
+    rgb = picture[..., :3]
+    seen = picture[..., 3] > HALF if picture.shape[2] > 3 else np.ones(rgb.shape[:2], bool)
+    return rgb if seen.all() else rgb.reshape(-1, 3)[nearest_of(seen)]
+
+
 def _split(root: Path, name: str) -> tuple[list[str], list[int]]:
-    content = _json(root / "splits" / f"{name}.json")
+    """Pictures and their times; those of camera 0 in the order of time."""
+    own = not (root / "splits").is_dir() and (root / "dataset.json").is_file()
+    content = _own_split(root, name) if own else _json(root / "splits" / f"{name}.json")
     try:
         names, times = [str(each) for each in content["frame_names"]], [int(each) for each in content["time_ids"]]
     except (KeyError, TypeError, ValueError) as error:
         raise DatasetError(f"{root}/splits/{name}.json: expected frame_names and time_ids ({error})") from error
     if len(names) != len(times) or (name == "train" and not names):
         raise DatasetError(f"{root}/splits/{name}.json: has {len(names)} frame_names and {len(times)} time_ids")
-    return names, times
+    order = np.argsort(times, kind="stable").tolist() if name == "train" else range(len(names))
+    return [names[i] for i in order], [times[i] for i in order]
+
+
+def _own_split(root: Path, name: str) -> dict[str, list[Any]]:
+    """What DyCheck's loader puts in splits/ where that is absent: camera 0 is fitted, the others validate."""
+    pictures, described = _json(root / "dataset.json"), _json(root / "metadata.json")
+    try:
+        ids = [each for each in pictures["ids"] if (described[each]["camera_id"] == 0) == (name == "train")]
+        return {"frame_names": ids, "time_ids": [described[each]["warp_id"] for each in ids]}
+    except (KeyError, TypeError) as error:
+        raise DatasetError(
+            f"{root}: has no splits/, and dataset.json and metadata.json do not tell ids, camera_id and warp_id of its "
+            f"pictures ({error})"
+        ) from error
 
 
 def _json(path: Path) -> Any:
@@ -143,9 +187,10 @@ def _json(path: Path) -> Any:
         ) from error
 
 
-def _json_cameras(root: Path, names: Sequence[str]) -> tuple[Float[ndarray, "n 3 3"], Float[ndarray, "n 4 4"], float]:
-    """Intrinsics (px at 1x) and world-from-camera (m) of the sequence's own files."""
+def _json_cameras(root: Path, names: Sequence[str]) -> _Cameras:
+    """Those of the sequence's own files."""
     intrinsics, poses = np.zeros((len(names), 3, 3)), np.tile(np.eye(4), (len(names), 1, 1))
+    sizes = np.zeros((len(names), 2))
     for i, name in enumerate(names):
         path = root / "camera" / f"{name}.json"
         content = _json(path)
@@ -155,13 +200,14 @@ def _json_cameras(root: Path, names: Sequence[str]) -> tuple[Float[ndarray, "n 3
             intrinsics[i] = [[focal, skew, x], [0, focal * ratio, y], [0, 0, 1]]
             poses[i, :3, :3] = np.array(content["orientation"], float).T
             poses[i, :3, 3] = content["position"]
+            sizes[i] = content["image_size"]
         except (KeyError, TypeError, ValueError) as error:
             raise DatasetError(f"{path}: no camera of the kind that DyCheck uses ({error})") from error
-    return intrinsics, poses, 1.0
+    return _Cameras(intrinsics, poses, sizes, 1.0)
 
 
-def _colmap_cameras(root: Path, names: Sequence[str]) -> tuple[Float[ndarray, "n 3 3"], Float[ndarray, "n 4 4"], float]:
-    """Intrinsics (px at 1x) and world-from-camera (m) that Shape of Motion refined; metres per unit of its files."""
+def _colmap_cameras(root: Path, names: Sequence[str]) -> _Cameras:
+    """Those that Shape of Motion refined."""
     demand_library("pycolmap", "sfm", "protocol 'som'")
     import pycolmap
 
@@ -185,11 +231,13 @@ def _colmap_cameras(root: Path, names: Sequence[str]) -> tuple[Float[ndarray, "n
     if absent:
         raise DatasetError(f"{folder / 'sparse'}: has no camera of {len(absent)} pictures, {absent[0]}.png among them")
     registered = [images[f"{name}.png"] for name in names]
-    intrinsics = np.stack([model.cameras[image.camera_id].calibration_matrix() for image in registered])
+    lenses = [model.cameras[image.camera_id] for image in registered]
+    intrinsics = np.stack([lens.calibration_matrix() for lens in lenses])
+    sizes = np.array([(lens.width, lens.height) for lens in lenses], float)
     poses = np.tile(np.eye(4), (len(names), 1, 1))
     poses[:, :3] = np.stack([image.cam_from_world().inverse().matrix() for image in registered])
     poses[:, :3, 3] *= metres
-    return intrinsics, poses, metres
+    return _Cameras(intrinsics, poses, sizes, metres)
 
 
 def _lidar(folder: Path, names: Sequence[str]) -> Float[ndarray, "t h w"] | None:

@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from lerobot_msdyn.core.errors import DatasetError
 from lerobot_msdyn.core.sampling import evenly
-from lerobot_msdyn.evaluate.dycheck.iphone import PROCESSED, IphoneSequence, read_array, read_picture
+from lerobot_msdyn.evaluate.dycheck.iphone import HALF, PROCESSED, IphoneSequence, read_array, read_picture
 from lerobot_msdyn.priors.exchange import Exchange
 
 QUERY_FRAMES = 12  # whose tracks are read; there is a file per pair of frames
@@ -41,7 +41,7 @@ def read_priors(sequence: IphoneSequence, width: int) -> Exchange:
 def _mask(path: Path, size: tuple[int, int]) -> UInt8[ndarray, "h w"]:
     picture = read_picture(path)
     mask = picture if picture.ndim == 2 else picture[..., 0]
-    return cv2.resize((mask > 0).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT)
+    return cv2.resize((mask > HALF).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT)
 
 
 def _depth(paths: Sequence[Path], size: tuple[int, int]) -> Float32[ndarray, "t h w"]:
