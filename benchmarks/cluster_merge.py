@@ -131,7 +131,7 @@ def _provenance(index: int) -> Provenance:
     frames = [FrameScores(frame, 25.0, 0.01, 4.0, 1.0) for frame in range(JUDGED)]
     causes = {"video": 1e-3, "geometry": 2e-3, "depth": 0.0, "sampling": 1e-4}
     heat = [[column % 7 for column in range(HEAT_WIDTH)] for _ in range(HEAT_WIDTH * HEIGHT // WIDTH)]
-    quality, nearby = (25.0 + 1e-3 * index, causes, 24.0, 0.9, 20.0, 30.0, 0.9, 0.1), (0.01, 4.0, 1.0, 1.0, 1.0)
+    quality, nearby = (25.0 + 1e-3 * index, causes, 24.0, 0.9, 20.0, 30.0, 0.9, 0.05, 0.05), (0.01, 4.0, 1.0, 1.0, 1.0)
     scores = record(Scores(*quality, True, *nearby, frames, heat))
     view = {"distance_m": 0.8, "what_moves": account, "scores": scores, "defects": []}
     priors = {name: {"provider": "made up", "why": "a benchmark"} for name in ("depth", "masks", "tracks", "camera")}
