@@ -1,6 +1,7 @@
 """What the recorded camera shows and the scene does not explain is shown as it was recorded, frame by frame."""
 
 import logging
+from collections.abc import Collection
 from dataclasses import replace
 
 import torch
@@ -15,7 +16,9 @@ from lerobot_msdyn.scene.overlay import FramePatch, Overlay, packed
 logger = logging.getLogger(__name__)
 
 
-def overlay_of(scene: DynamicScene, view: View, priors: Priors, backend: str = "auto") -> Overlay:
+def overlay_of(
+    scene: DynamicScene, view: View, priors: Priors, backend: str = "auto", *, explained: Collection[int] = ()
+) -> Overlay:
     """The patches of all frames that make the recorded camera see what it recorded (docs/reconstruction.md, "Overlay").
 
     A pixel is unexplained where the rendered picture has another colour or depth than the recorded one. There the
@@ -28,11 +31,15 @@ def overlay_of(scene: DynamicScene, view: View, priors: Priors, backend: str = "
         view: the video, at the size at which it was fitted.
         priors: its depth.
         backend: of the rasterizer.
+        explained: frames at which nothing is left to be shown.
     """
     comparison = Comparison(scene, view, priors, backend)
 
     def patch_of(frame: int) -> FramePatch:
-        snapshot, short = comparison.snapshot(frame), scene.short_lived_patch(frame)
+        short = scene.short_lived_patch(frame)
+        if frame in explained:
+            return _nothing(len(scene.static) + len(scene.moving) + (0 if short is None else len(short)))
+        snapshot = comparison.snapshot(frame)
         if short is not None:
             snapshot = patched(snapshot, short)
         wrong = comparison.wrong(snapshot, frame)
@@ -44,6 +51,12 @@ def overlay_of(scene: DynamicScene, view: View, priors: Priors, backend: str = "
     percent = 100 * len(overlay.means) / max(priors.depth.numel(), 1)
     logger.info("overlay: %.1f %% of all pixels are not explained and shown as recorded", percent)
     return overlay
+
+
+def _nothing(gaussians: int) -> FramePatch:
+    """A patch that shows nothing, and hides none of so many."""
+    none = torch.zeros(0, 3)
+    return FramePatch(none, torch.zeros(0, 4), none, none, torch.zeros(gaussians, dtype=torch.bool))
 
 
 def _of_all(patch: FramePatch, short: FramePatch) -> torch.Tensor:

@@ -47,6 +47,11 @@ class Born:
     shown: dict[int, Bool[Tensor, " n"]]  # by frame
 
 
+def key_frames(frames: int, reach: int) -> range:
+    """Those of a video whose unexplained pixels become short-lived Gaussians that reach so many frames either way."""
+    return range(min(reach, frames - 1), frames, 2 * reach)
+
+
 def short_lived_of(scene: DynamicScene, view: View, priors: Priors, reach: int, backend: str = "auto") -> ShortLived:
     """What every (2 reach)th frame shows and the scene does not explain, for up to `reach` frames to either side.
 
@@ -64,7 +69,7 @@ def short_lived_of(scene: DynamicScene, view: View, priors: Priors, reach: int, 
     comparison, host, count = Comparison(scene, view, priors, backend), to_device(scene, "cpu"), len(view.rgb)
     everywhere = in_threads if scene.device.type == "cpu" else map
     wrong = [*everywhere(lambda frame: comparison.wrong(comparison.snapshot(frame), frame), range(count))]
-    keys = range(min(reach, count - 1), count, 2 * reach)
+    keys = key_frames(count, reach)
     born = [*everywhere(lambda key: _born(comparison, host, key, reach, wrong), keys)]
     shown = [_shown(born, frame) for frame in range(count)]
     own = len(scene.static) + len(scene.moving)
@@ -81,6 +86,8 @@ def short_lived_of(scene: DynamicScene, view: View, priors: Priors, reach: int, 
     with_them = replace(host, short_lived=unhidden)
 
     def hidden(frame: int) -> Bool[Tensor, " g"]:
+        if frame in keys:
+            return born[keys.index(frame)].patch.hidden
         patch = with_them.short_lived_patch(frame)
         assert patch is not None
         covered = torch.from_numpy(_covered(patch.means, comparison, frame) & wrong[frame])

@@ -29,7 +29,7 @@ from lerobot_msdyn.reconstruction.fit import FitResult, fit
 from lerobot_msdyn.reconstruction.initialise import initialise
 from lerobot_msdyn.reconstruction.key_views import KeyView, fixed_view, key_views
 from lerobot_msdyn.reconstruction.make_overlay import overlay_of
-from lerobot_msdyn.reconstruction.make_short_lived import short_lived_of
+from lerobot_msdyn.reconstruction.make_short_lived import key_frames, short_lived_of
 from lerobot_msdyn.reconstruction.pooled_background import (
     SharedBackground,
     adapted,
@@ -193,7 +193,9 @@ def _short_lived(draft: Draft) -> None:
 def _overlay(draft: Draft) -> None:
     """Recorded pixels of single frames that the scene does not explain."""
     if draft.recipe.scene.overlay:
-        overlay = overlay_of(draft.scene, draft.view, draft.priors)
+        reach = draft.recipe.scene.short_lived
+        explained = key_frames(len(draft.view), reach) if reach > 0 else ()
+        overlay = overlay_of(draft.scene, draft.view, draft.priors, explained=explained)
         draft.scene = replace(draft.scene, overlay=to_device(overlay, draft.scene.device))
 
 
