@@ -105,7 +105,7 @@ def test_provenance_is_carried_over(desk: Path, outputs: tuple[Path, Path], merg
     assert origins[:3] == [("local/desk", e, -1) for e in (0, 1, 2)]
     assert origins[3:] == [("local/desk", e, v) for _ in outputs for e in (0, 1, 2) for v in (-1, 0)]
     assert [row["seed"] for row in rows if row["variant"] == 0] == [1, 1, 1, 2, 2, 2]
-    assert "6 of the 15 episodes of this dataset are synthetic" in (merged / "README.md").read_text()
+    assert "6 of the 15 episodes in this dataset are synthetic" in (merged / "README.md").read_text()
     split = split_by_source(merged, 0.34)
     assert split.train == [0, 1, 3, 4, 5, 6, 9, 10, 11, 12]
     assert split.evaluation == [2, 7, 13]
@@ -185,7 +185,7 @@ def test_push_carries_everything(outputs: tuple[Path, Path], monkeypatch: pytest
     sent = set(filter_repo_objects(names, ignore_patterns=upload["ignore_patterns"]))
     assert {"meta/msdyn/episodes.parquet", "meta/msdyn/recipe.yaml", "meta/info.json", "README.md"} <= sent
     assert calls["card"] == (root / "README.md").read_text()
-    assert "3 of the 6 episodes of this dataset are synthetic" in calls["card"]
+    assert "3 of the 6 episodes in this dataset are synthetic" in calls["card"]
     assert "More Information Needed" not in calls["card"]
 
 

@@ -94,7 +94,6 @@ def measure_speeds(source: LeRobotDatasetMetadata, index: int, cameras: list[str
     views = episode.views
     if not recipe.needs_whole_videos:
         views = {key: _middle(view) for key, view in views.items()}
-    first = len(episode.time) // 2 - len(next(iter(views.values()))) // 2
     prepare_s = step_s = render_s = scene_bytes = frame_bytes = video_bytes = 0.0
     videos: list[str] = []
     for key, part in views.items():
@@ -104,7 +103,7 @@ def measure_speeds(source: LeRobotDatasetMetadata, index: int, cameras: list[str
             scene, of_priors, of_step = _timed_fit(part, short, others, index, key)
             prepare_s, step_s = prepare_s + of_priors, step_s + of_step
         else:
-            scene, times = earlier_scene(recipe.scenes, index, key), times + first
+            scene, times = earlier_scene(recipe.scenes, index, key), times + (frames - len(part)) // 2
         once, each = _saved_sizes(scene.windows[0].scene)
         scene_bytes, frame_bytes = scene_bytes + once, frame_bytes + each
         with tempfile.TemporaryDirectory() as folder, time_spent_compiling() as compiling_s:
