@@ -6,8 +6,7 @@ from pathlib import Path
 from lerobot.datasets import LeRobotDatasetMetadata
 
 from lerobot_msdyn.core.errors import ConfigError
-from lerobot_msdyn.core.files import digest_of_file
-from lerobot_msdyn.reconstruction.on_disk import JUDGED, load_reconstruction
+from lerobot_msdyn.reconstruction.on_disk import fit_digest, load_reconstruction
 from lerobot_msdyn.reconstruction.result import Reconstruction
 from lerobot_msdyn.scene.store import camera_folder, list_scenes, read_header, scenes_root
 
@@ -55,9 +54,9 @@ def earlier_scene(folder: Path, episode: int, camera: str) -> Reconstruction:
 
 
 def digests_of_scenes(folder: Path) -> dict[str, str]:
-    """What tells the scenes of one fit from those of another, without reading them whole."""
+    """What tells the scenes of one run from those of another."""
     return {
-        f"{index}/{key}": digest_of_file(place / JUDGED)
+        f"{index}/{key}": fit_digest(place)
         for index, of_cameras in list_scenes(folder).items()
         for key, place in of_cameras.items()
     }

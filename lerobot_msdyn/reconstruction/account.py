@@ -57,7 +57,7 @@ class Account:
     @staticmethod
     def from_entry(entry: dict[str, Any]) -> "Account":
         """The account that an `entry` was made of, up to rounding."""
-        shares = (entry.get(name, 0.0) for name in MovingPixels().shares)  # earlier versions had fewer kinds
+        shares = (entry[name] for name in MovingPixels().shares)
         pixels = MovingPixels(*(round(entry["pixels"] * share) for share in shares))
         shown, alone = (
             0.0 if db is None else 10 ** (-db / 10) for db in (entry["dynamic_db"], entry["dynamic_by_motion_db"])

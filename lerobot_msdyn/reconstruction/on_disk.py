@@ -1,8 +1,13 @@
 """A reconstruction on disk: its saved scene (scene/store.py) and, beside it, what new views are judged by."""
 
+import hashlib
+import json
 from dataclasses import fields
 from pathlib import Path
 
+from safetensors import SafetensorError, safe_open
+
+from lerobot_msdyn.core.files import DIGEST_BYTES
 from lerobot_msdyn.core.serialise import ValueFileError, load_value
 from lerobot_msdyn.reconstruction.result import FittedWindow, Reconstruction
 from lerobot_msdyn.scene import store
@@ -20,6 +25,16 @@ def save_reconstruction(made: Reconstruction, source: SceneSource, root: Path) -
     """
     windows = [{name: getattr(window, name) for name in _KNOWN} for window in made.windows]
     return store.save(made.saved(source), root, {JUDGED: {"stands": made.stands, "windows": windows}})
+
+
+def fit_digest(folder: Path) -> str:
+    """A digest of what is known of a fit (scores, seconds), without its tensors; empty where that cannot be read."""
+    try:
+        with safe_open(folder / JUDGED, framework="np") as file:
+            known = json.dumps(file.metadata(), sort_keys=True)
+    except (OSError, SafetensorError):  # said when it is loaded
+        return ""
+    return hashlib.blake2b(known.encode(), digest_size=DIGEST_BYTES).hexdigest()
 
 
 def load_reconstruction(folder: Path) -> Reconstruction:

@@ -66,7 +66,7 @@ class Comparison:
 
     def taken(self, wrong: Bool[ndarray, "h w"], frame: int) -> Bool[ndarray, "h w"]:
         """Those of the wrong pixels whose recorded colour is that of one surface."""
-        still = self._still_depth(0 if self.view.camera.is_static else frame)
+        still = self._fixed_still_depth if self.view.camera.is_static else self._still_depth(frame)
         return wrong & ~_behind_an_edge(self.depth(frame).numpy(), still)
 
     def patch(
@@ -107,16 +107,14 @@ class Comparison:
         return to_device(self.view.camera.select([frame]), self.scene.device)
 
     def _still_depth(self, frame: int) -> Float[ndarray, "h w"]:
-        """Of what stands still (m); of a fixed camera rendered once."""
-        if frame not in self._still_depths:
-            frames, camera = torch.tensor([frame]), self.view.camera.select([frame])
-            rendering = render_scene(self.scene.still(), camera, frames, self.backend)
-            self._still_depths[frame] = rendering.depth[0].cpu().numpy()
-        return self._still_depths[frame]
+        """Of what stands still (m)."""
+        frames, camera = torch.tensor([frame]), self.view.camera.select([frame])
+        return render_scene(self.scene.still(), camera, frames, self.backend).depth[0].cpu().numpy()
 
     @cached_property
-    def _still_depths(self) -> dict[int, Float[ndarray, "h w"]]:
-        return {}
+    def _fixed_still_depth(self) -> Float[ndarray, "h w"]:
+        """Before a fixed camera, rendered once."""
+        return self._still_depth(0)
 
 
 def wrong_pixels(
