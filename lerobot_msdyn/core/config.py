@@ -307,7 +307,7 @@ class FitConfig:
     steps: int = between(500, 0, 1_000_000)
     # Before a fixed camera without measured depth every so many-th step looks at a whole picture, the others only near
     # what moves; 1: all.
-    whole_every: int = between(4, 1, 1_000_000)
+    whole_every: int = between(16, 1, 1_000_000)
     # Widest image that is fitted, in pixels; wider videos are fitted at a reduced size and rendered at their own.
     max_width: int = between(320, 16, 8192)
     # Longest part of a video that is fitted as one scene, in frames; longer videos are cut into equal parts.

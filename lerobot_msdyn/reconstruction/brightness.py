@@ -1,5 +1,6 @@
 """How brightness changes over time: of the static set by the video alone, of the moving set by a rendered scene."""
 
+import functools
 from dataclasses import dataclass
 
 import cv2
@@ -16,6 +17,7 @@ from lerobot_msdyn.core.sampling import scaled_px, scaled_window
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.core.visibility import projected
 from lerobot_msdyn.priors import Priors
+from lerobot_msdyn.render.cpu.threads import in_threads
 from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.rendering import render_scene
 from lerobot_msdyn.scene.shading import Shading, encode_gain, no_shading
@@ -177,7 +179,9 @@ def moving_gain(scene: DynamicScene, view: View, priors: Priors, backend: str = 
     Rendered with the gains that the scene has already, so that these only need to be multiplied by what is returned.
     """
     frames = sorted({*range(0, len(view.rgb), MOVING_STEP), len(view.rgb) - 1})
-    sums = torch.stack([_seen_sums(scene, view, priors, frame, backend) for frame in frames])  # s m 2
+    of_frame = functools.partial(_seen_sums, scene, view, priors, backend)
+    on_host = scene.device.type == "cpu"
+    sums = torch.stack(list(in_threads(of_frame, frames) if on_host else map(of_frame, frames)))  # s m 2
     if len(frames) > 2:
         padded = torch.nn.functional.pad(sums.permute(1, 2, 0), (1, 1))
         sums = torch.nn.functional.avg_pool1d(padded, 3, stride=1).permute(2, 0, 1)
@@ -186,7 +190,7 @@ def moving_gain(scene: DynamicScene, view: View, priors: Priors, backend: str = 
     return encode_gain(_at_every_frame(log, seen, torch.tensor(frames), len(view.rgb)).exp())
 
 
-def _seen_sums(scene: DynamicScene, view: View, priors: Priors, frame: int, backend: str) -> Float[Tensor, "m 2"]:
+def _seen_sums(scene: DynamicScene, view: View, priors: Priors, backend: str, frame: int) -> Float[Tensor, "m 2"]:
     """Blurred brightness recorded and rendered at the pixel of each moving Gaussian; zero where it is not seen."""
     camera, when = view.camera.select([frame]), torch.tensor([frame])
     rendered = to_device(render_scene(scene, camera, when, backend), "cpu")

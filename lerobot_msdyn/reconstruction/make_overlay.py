@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Collection
-from dataclasses import replace
 
 import torch
 
@@ -43,8 +42,7 @@ def overlay_of(
         if short is not None:
             snapshot = patched(snapshot, short)
         wrong = comparison.wrong(snapshot, frame)
-        patch = comparison.patch(snapshot, frame, wrong, comparison.taken(wrong, frame))
-        return patch if short is None else replace(patch, hidden=_of_all(patch, short))
+        return comparison.patch(snapshot, frame, wrong, comparison.taken(wrong, frame))
 
     frames = range(len(view.rgb))
     overlay = packed([*(in_threads(patch_of, frames) if scene.device.type == "cpu" else map(patch_of, frames))])
@@ -57,14 +55,3 @@ def _nothing(gaussians: int) -> FramePatch:
     """A patch that shows nothing, and hides none of so many."""
     none = torch.zeros(0, 3)
     return FramePatch(none, torch.zeros(0, 4), none, none, torch.zeros(gaussians, dtype=torch.bool))
-
-
-def _of_all(patch: FramePatch, short: FramePatch) -> torch.Tensor:
-    """What is hidden of the scene's own Gaussians and, behind them, of the frame's short-lived ones.
-
-    The patch tells it of those own ones that the short-lived do not hide, and of these.
-    """
-    own = torch.zeros_like(short.hidden.cpu())
-    kept = (~short.hidden.cpu()).nonzero()[:, 0]
-    own[kept] = patch.hidden[: len(kept)]
-    return torch.cat((own, patch.hidden[len(kept) :]))

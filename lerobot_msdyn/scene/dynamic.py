@@ -30,15 +30,16 @@ class Snapshot:
 
 def patched(snapshot: Snapshot, patch: FramePatch) -> Snapshot:
     """A snapshot of one frame, with a patch in place of what the patch hides; the patch counts as moving."""
-    kept, ones = (~patch.hidden).nonzero()[:, 0], patch.means.new_ones(len(patch))
+    ones = patch.means.new_ones(len(patch))
+    left = torch.where(patch.hidden, 0.0, snapshot.opacities)  # less to copy than without what is hidden
     return Snapshot(
-        means=torch.cat((snapshot.means[:, kept], patch.means[None]), dim=1),
-        quats=torch.cat((snapshot.quats[:, kept], patch.quats[None]), dim=1),
-        scales=torch.cat((snapshot.scales[kept], patch.log_scales.exp())),
-        opacities=torch.cat((snapshot.opacities[kept], PATCH_OPACITY * ones)),
-        rgb=torch.cat((snapshot.rgb[:, kept], patch.rgb[None]), dim=1),
-        moving=torch.cat((snapshot.moving[kept], ones)),
-        extra=None if snapshot.extra is None else torch.cat((snapshot.extra[kept], ones)),
+        means=torch.cat((snapshot.means, patch.means[None]), dim=1),
+        quats=torch.cat((snapshot.quats, patch.quats[None]), dim=1),
+        scales=torch.cat((snapshot.scales, patch.log_scales.exp())),
+        opacities=torch.cat((left, PATCH_OPACITY * ones)),
+        rgb=torch.cat((snapshot.rgb, patch.rgb[None]), dim=1),
+        moving=torch.cat((snapshot.moving, ones)),
+        extra=None if snapshot.extra is None else torch.cat((snapshot.extra, ones)),
     )
 
 

@@ -13,7 +13,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.core.geometry import transform_points, unproject_image
+from lerobot_msdyn.core.geometry import pixel_grid, transform_points, unproject
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.reconstruction.evidence import Evidence, still_frames
 from lerobot_msdyn.scene.rendering import Rendering
@@ -35,34 +35,49 @@ class Coverage:
         return float(self.unseen.mean())
 
 
-def coverage_of(rendering: Rendering, camera: CameraTrack, evidence: Evidence) -> list[Coverage]:
+@dataclass(frozen=True)
+class Looked:
+    """What has been looked up of one picture of a fixed camera: less is left to look up of the next one."""
+
+    depth: Float[Tensor, "h w"]  # m
+    still: Int[Tensor, "h w"]  # frames that show what stands still at that depth
+
+
+def coverage_of(
+    rendering: Rendering, camera: CameraTrack, evidence: Evidence, before: Looked | None = None
+) -> list[Coverage]:
     """Coverage of some frames, computed on the device of the rendering and the evidence.
 
     Args:
         rendering: the frames, with the frames that show each moving Gaussian as its `extra`.
         camera: through which they were rendered, one pose each.
         evidence: what was recorded.
+        before: of the first pose, if the camera is a fixed one.
     """
     assert rendering.extra is not None
     device = rendering.depth.device
     holds = camera.is_static and device.type == "cpu"  # elsewhere to look for what differs costs more than it spares
     camera = to_device(camera, device)
-    coverages, still = [], torch.zeros(0, dtype=torch.long)
+    coverages: list[Coverage] = []
     for i, (depth, alpha) in enumerate(zip(rendering.depth, rendering.alpha, strict=True)):
-        pose = camera.select([i])
-        if holds and i > 0:  # what the frame before has shown
-            new = depth != rendering.depth[i - 1]
-            still = still.clone()
-            still[new] = still_frames(evidence, _points(depth, pose)[new.flatten()])
-        else:
-            still = still_frames(evidence, _points(depth, pose)).reshape(depth.shape)
+        before = looked(depth, camera.select([i]), evidence, before if holds else None)
         moving = rendering.moving[i] > 0.5 * alpha
         frames_moving = (rendering.extra[i] / rendering.moving[i].clamp(min=1e-6)).round().long()
         empty = alpha < HOLE_ALPHA
-        frames = torch.where(moving, frames_moving, still).masked_fill(empty, 0)
+        frames = torch.where(moving, frames_moving, before.still).masked_fill(empty, 0)
         on_host = to_device((frames == 0, frames, empty), "cpu")
         coverages.append(Coverage(*(values.numpy() for values in on_host)))
     return coverages
+
+
+def looked(depth: Float[Tensor, "h w"], pose: CameraTrack, evidence: Evidence, before: Looked | None = None) -> Looked:
+    """Looks up what stands still in a picture: all of it, or what differs from one that was looked up before."""
+    if before is None:
+        return Looked(depth, still_frames(evidence, _points(depth, pose)).reshape(depth.shape))
+    new = depth != before.depth
+    still = before.still.clone()
+    still[new] = still_frames(evidence, _points(depth, pose, new))
+    return Looked(depth, still)
 
 
 def angles_of(depth: Float[Tensor, "h w"], camera: CameraTrack, recorded: CameraTrack) -> Float32[ndarray, "h w"]:
@@ -81,6 +96,10 @@ def angles_of(depth: Float[Tensor, "h w"], camera: CameraTrack, recorded: Camera
     return torch.rad2deg(torch.arccos(cosine)).reshape(depth.shape).numpy()
 
 
-def _points(depth: Float[Tensor, "h w"], camera: CameraTrack) -> Float[Tensor, "n 3"]:
-    """What the pixels show (m, world) through the first pose of a camera."""
-    return transform_points(camera.world_from_camera[0], unproject_image(depth, camera.intrinsics[0]).reshape(-1, 3))
+def _points(
+    depth: Float[Tensor, "h w"], camera: CameraTrack, which: Bool[Tensor, "h w"] | None = None
+) -> Float[Tensor, "n 3"]:
+    """What the pixels, or some of them, show (m, world) through the first pose of a camera."""
+    which = torch.ones_like(depth, dtype=torch.bool) if which is None else which
+    in_camera = unproject(pixel_grid(*depth.shape, depth.device)[which], depth[which], camera.intrinsics[0])
+    return transform_points(camera.world_from_camera[0], in_camera)

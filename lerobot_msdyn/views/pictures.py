@@ -17,13 +17,21 @@ from lerobot_msdyn.reconstruction.result import FittedWindow, Reconstruction
 from lerobot_msdyn.render.cpu.threads import in_threads
 from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.rendering import Rendering, render_frames
-from lerobot_msdyn.views.coverage import Coverage, coverage_of
+from lerobot_msdyn.views.coverage import Coverage, Looked, coverage_of, looked
 from lerobot_msdyn.views.filling import filled, missing
 
 logger = logging.getLogger(__name__)
 
 BATCH = 4  # frames that are rendered at a time, by each thread
 Rendered = tuple[Rendering, list[Coverage], Float[Tensor, "#t #h #w 3"]]  # frames, their coverage, what fills holes
+
+
+@dataclass(frozen=True)
+class _Still:
+    """What stands still through a fixed camera, the same for all frames: nothing flickers, and it is looked up once."""
+
+    filling: Float[Tensor, "1 h w 3"] | None  # with its holes filled
+    looked: Looked
 
 
 @dataclass(frozen=True)
@@ -105,9 +113,8 @@ def _rendered(
     frames = torch.arange(len(scene.camera)) if frames is None else frames
     for window, part in scene.stretches(frames):
         times, poses = frames[part] - window.start, camera.select(part)
-        once = poses.is_static and fill != "none"
-        filling = _filled_background(window.scene, poses, times, fill) if once else None
-        some = functools.partial(_some_rendered, window, poses, times, fill, filling)
+        still = _still(window, poses, times, fill) if poses.is_static else None
+        some = functools.partial(_some_rendered, window, poses, times, fill, still)
         starts = range(0, len(times), BATCH)
         yield from in_threads(some, starts) if window.scene.device.type == "cpu" else map(some, starts)
 
@@ -117,7 +124,7 @@ def _some_rendered(
     camera: CameraTrack,
     times: Int[Tensor, " every"],
     fill: Fill,
-    filling: Float[Tensor, "1 h w 3"] | None,
+    still: _Still | None,
     start: int,
 ) -> Rendered:
     """A batch of a window's frames."""
@@ -126,24 +133,28 @@ def _some_rendered(
     rendering = next(render_frames(window.scene, poses, times[batch], extra=window.evidence.moving_frames))
     if fill == "none":
         behind = rendering.rgb.new_zeros(1, 1, 1, 3)
-    elif filling is None:
+    elif still is None or still.filling is None:
         behind = torch.stack([_filled(rendering, i, fill) for i in range(len(rendering.alpha))])
     else:
-        behind = filling * _brightness(window.scene, times[batch], times)
-    return rendering, coverage_of(rendering, poses, window.evidence), behind
+        behind = still.filling * _brightness(window.scene, times[batch], times)
+    looked_up = None if still is None else still.looked
+    return rendering, coverage_of(rendering, poses, window.evidence, looked_up), behind
+
+
+@torch.no_grad()
+def _still(window: FittedWindow, camera: CameraTrack, times: Tensor, fill: Fill) -> _Still:
+    """What a fixed camera sees of what stands still, in the middle of its frames."""
+    middle = [len(times) // 2]
+    pose = camera.select(middle)
+    rendering = next(render_frames(window.scene.still(), pose, times[middle]))
+    filling = None if fill == "none" else _filled(rendering, 0, fill)[None]
+    return _Still(filling, looked(rendering.depth[0], to_device(pose, rendering.depth.device), window.evidence))
 
 
 def _filled(rendering: Rendering, i: int, fill: Fill) -> Float[Tensor, "h w 3"]:
     """One frame of a rendering with its holes filled, on the rendering's device."""
     picture = to_device((rendering.rgb[i], rendering.alpha[i], rendering.depth[i]), "cpu")
     return filled(*picture, fill).to(rendering.rgb.device)
-
-
-def _filled_background(scene: DynamicScene, camera: CameraTrack, times: Tensor, fill: Fill) -> Float[Tensor, "1 h w 3"]:
-    """The background through a fixed camera, filled once for all frames, so that nothing flickers."""
-    middle = [len(times) // 2]
-    rendering = next(render_frames(scene.still(), camera.select(middle), times[middle]))
-    return _filled(rendering, 0, fill)[None]
 
 
 def _brightness(scene: DynamicScene, times: Tensor, all_times: Tensor) -> Float[Tensor, "t 1 1 1"] | float:

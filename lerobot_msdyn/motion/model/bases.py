@@ -7,6 +7,7 @@ from typing import ClassVar
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
 
 from lerobot_msdyn.core.geometry import (
     matrix_to_quaternion,
@@ -17,6 +18,8 @@ from lerobot_msdyn.core.geometry import (
 from lerobot_msdyn.motion.model.carried import DEGENERATE, carried, carried_points
 
 COARSEST = -1  # the parent of a basis that nothing carries
+
+_known_shares: WeakTensorKeyDictionary = WeakTensorKeyDictionary()  # logits -> their version, their softmax
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,20 @@ class MotionLevel:
         """Whether any basis is active, asked of its device once."""
         return bool(self.active.any())
 
+    @cached_property
+    def _at_frames(self) -> Float[Tensor, "k t 3 4"]:
+        """The maps of every basis at the frames from the first knot to the last."""
+        first, last = self.knots[0].item(), self.knots[-1].item()
+        return level_affines(self, torch.arange(int(first), int(last) + 1, device=self.knots.device))
+
+    def affines(self, times: Float[Tensor, " b"] | Int[Tensor, " b"]) -> Float[Tensor, "k b 3 4"]:
+        """The maps of every basis at some times, in frames: `level_affines`, computed once unless they are learned."""
+        learned = self.rotations_6d.requires_grad or self.displacements.requires_grad
+        if learned or times.is_floating_point():
+            return level_affines(self, times)
+        maps = self._at_frames
+        return maps[:, (times - int(self.knots[0])).clamp(0, maps.shape[1] - 1)]
+
     def carry(
         self,
         positions: Float[Tensor, "b n 3"],
@@ -56,9 +73,9 @@ class MotionLevel:
         """Positions (m) and orientations (wxyz) moved by the bases that each point names, at the times of the batch."""
         if not self._moves:
             return positions, orientations
-        affines = level_affines(self, times)
+        affines = self.affines(times)
         if _compiled(affines, positions):
-            return carried(affines, torch.softmax(logits, dim=-1), indices, positions, orientations)
+            return carried(affines, shares_of(logits), indices, positions, orientations)
         blended = blend(affines, indices, logits)
         rotations = _nearest_rotations(blended, affines, indices, logits)
         turned = quaternion_multiply(matrix_to_quaternion(rotations), orientations)
@@ -74,10 +91,21 @@ class MotionLevel:
         """Positions (m) as `carry` moves them, without orientations, which take most of its time."""
         if not self._moves:
             return positions
-        affines = level_affines(self, times)
+        affines = self.affines(times)
         if _compiled(affines, positions):
-            return carried_points(affines, torch.softmax(logits, dim=-1), indices, positions)
+            return carried_points(affines, shares_of(logits), indices, positions)
         return _applied(blend(affines, indices, logits), positions)
+
+
+def shares_of(logits: Float[Tensor, "n j"]) -> Float[Tensor, "n j"]:
+    """By how much each point follows its bases: softmax, computed once for logits that nobody learns or changes."""
+    if logits.requires_grad:
+        return torch.softmax(logits, dim=-1)
+    version, shares = _known_shares.get(logits, (None, logits))
+    if version != logits._version:
+        shares = torch.softmax(logits, dim=-1)
+        _known_shares[logits] = (logits._version, shares)
+    return shares
 
 
 def _compiled(affines: Tensor, positions: Tensor) -> bool:

@@ -70,10 +70,11 @@ class _Carry(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         affines, weights, indices, positions, quats = ctx.saved_tensors
+        learned = any(ctx.needs_input_grad[:2])
         given = [each.contiguous().numpy() for each in gradients]
         tickets = point_tickets(*positions.shape[:2])
-        to_affines = np.zeros((tickets, len(affines), 12), np.float32)
-        to_weights = np.empty((len(positions), *weights.shape), np.float32)
+        to_affines = np.zeros((tickets if learned else 0, len(affines), 12), np.float32)
+        to_weights = np.empty((len(positions) if learned else 0, *weights.shape), np.float32)
         to_positions, to_quats = (np.empty(each.shape, np.float32) for each in (positions, quats))
         run(
             _backward,
@@ -86,14 +87,11 @@ class _Carry(torch.autograd.Function):
             to_positions,
             to_quats,
         )
+        to_points = torch.from_numpy(to_positions), torch.from_numpy(to_quats)
+        if not learned:
+            return None, None, None, *to_points
         by_time = torch.from_numpy(to_affines).unflatten(0, (len(positions), -1)).sum(1).transpose(0, 1)
-        return (
-            by_time.reshape(affines.shape),
-            torch.from_numpy(to_weights).sum(0),
-            None,
-            torch.from_numpy(to_positions),
-            torch.from_numpy(to_quats),
-        )
+        return by_time.reshape(affines.shape), torch.from_numpy(to_weights).sum(0), None, *to_points
 
 
 @inlined
@@ -217,7 +215,7 @@ def _backward(
     to_positions: ndarray,
     to_quats: ndarray,
 ) -> None:
-    """Gradients, given those of the results (`moved`, `turned`); those of the maps block by block.
+    """Gradients, given those of the results (`moved`, `turned`); of the maps, block by block, if there is room.
 
     A change w of the rotation (a rotation vector) changes the result q by (0, w) q / 2, so that the gradient of w is
     half the vector part of dq conj(q). Of the columns a and b = first and second, with axes x, y, z, |a| and the rest
@@ -226,7 +224,7 @@ def _backward(
     batch, count = positions.shape[:2]
     blocks = -(-count // POINTS_PER_TICKET)
     map_, to_map = np.empty(12, np.float32), np.empty(12, np.float32)
-    oriented = quats.shape[1] > 0
+    oriented, learned = quats.shape[1] > 0, len(to_affines) > 0
     ticket = take_ticket(tickets)
     while ticket < batch * blocks:
         time, block = ticket // blocks, ticket % blocks
@@ -242,14 +240,16 @@ def _backward(
             if oriented:
                 a0, a1, a2, b0, b1, b2, single = _columns(map_, indices, weights, affines, time, point)
                 x0, x1, x2, y0, y1, y2, length, along, rest = _frame(a0, a1, a2, b0, b1, b2)
-                z0, z1, z2 = x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
                 pw, px, py, pz = _quaternion(x0, x1, x2, y0, y1, y2)
-                qw, qx, qy, qz = quats[time, point]
                 gw, gx, gy, gz = turned[time, point]
-                rw, rx, ry, rz = _product(pw, px, py, pz, qw, qx, qy, qz)
                 tw, tx, ty, tz = _product(pw, -px, -py, -pz, gw, gx, gy, gz)
                 to_quats[time, point, 0], to_quats[time, point, 1] = tw, tx
                 to_quats[time, point, 2], to_quats[time, point, 3] = ty, tz
+                if not learned:
+                    continue
+                z0, z1, z2 = x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
+                qw, qx, qy, qz = quats[time, point]
+                rw, rx, ry, rz = _product(pw, px, py, pz, qw, qx, qy, qz)
                 _, wx, wy, wz = _product(gw, gx, gy, gz, rw, -rx, -ry, -rz)
                 about_x = 0.5 * (wx * x0 + wy * x1 + wz * x2)
                 about_y = 0.5 * (wx * y0 + wy * y1 + wz * y2)
@@ -271,7 +271,7 @@ def _backward(
                     to_affines[ticket, single, 1] += of_b * z0
                     to_affines[ticket, single, 5] += of_b * z1
                     to_affines[ticket, single, 9] += of_b * z2
-            for slot in range(indices.shape[1]):
+            for slot in range(indices.shape[1] if learned else 0):
                 basis, weight = indices[point, slot], weights[point, slot]
                 total = np.float32(0)
                 for entry in range(12):
