@@ -22,6 +22,7 @@ from lerobot_msdyn.core.images import box_about
 from lerobot_msdyn.core.observations import PointTracks
 from lerobot_msdyn.core.sampling import scaled_window
 from lerobot_msdyn.priors.tracks.patches import Patches, cut, register, sample
+from lerobot_msdyn.render.cpu.threads import in_threads
 
 PairFlow = Callable[[ndarray, ndarray], ndarray]
 
@@ -30,6 +31,7 @@ _EDGE_MARGIN_PX = 2  # of 320, of the first points of a track from the edge of t
 _SMALL_INSTANCE = 0.013  # of the picture: ... and half of that in instances smaller than this
 _BACKGROUND_GREY = 128  # of what does not move, while flow is computed
 _LEAST_FLOW_PX = 64  # side of the part of a picture in which flow is computed
+_PAIRS = 16  # of frames, whose flow a thread computes at a time
 _SMOOTH_PX = 4  # of 320, to either side, over which an instance's flow is averaged for the second guess
 _STALE_NCC = 0.8  # below this the anchor no longer looks like the point: take a newer one ...
 _MIN_ANCHOR_AGE = 4  # ... unless it is younger than this, in frames
@@ -142,19 +144,30 @@ def _dis_flows(
     grey: list[UInt8[ndarray, "h w"]], labels: UInt8[ndarray, "t h w"]
 ) -> tuple[list[ndarray], list[ndarray]]:
     """Flow of what moves between neighbouring frames, there and back; 0 far from what moves."""
+    alone = [_without_background(image, mask) for image, mask in zip(grey, labels > 0, strict=True)]
+    flows = np.zeros((2, len(grey) - 1, *grey[0].shape, 2), np.float16)
+
+    def of_pairs(pairs: range) -> None:
+        dis = _dis()  # not for two threads at once
+        for t in pairs:
+            box = box_about((labels[t] > 0) | (labels[t + 1] > 0), _LEAST_FLOW_PX)
+            a, b = alone[t][box].copy(), alone[t + 1][box].copy()
+            if a.size:
+                flows[0, t][box], flows[1, t][box] = dis.calc(a, b, None), dis.calc(b, a, None)
+
+    pairs = range(len(grey) - 1)
+    for _ in in_threads(of_pairs, [pairs[i : i + _PAIRS] for i in range(0, len(pairs), _PAIRS)]):
+        pass
+    return list(flows[0]), list(flows[1])
+
+
+def _dis() -> cv2.DISOpticalFlow:
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     dis.setFinestScale(0)  # on small, plain parts of a robot a fifth to a third less error than the preset's half size
     dis.setPatchStride(4)  # this and the next two take 40 % off the time and change 0.04 px, which tracks do not show
     dis.setGradientDescentIterations(16)
     dis.setVariationalRefinementIterations(3)
-    alone = [_without_background(image, mask) for image, mask in zip(grey, labels > 0, strict=True)]
-    flows = np.zeros((2, len(grey) - 1, *grey[0].shape, 2), np.float16)
-    for t, (a, b) in enumerate(itertools.pairwise(alone)):
-        box = box_about((labels[t] > 0) | (labels[t + 1] > 0), _LEAST_FLOW_PX)
-        if a[box].size:
-            flows[0, t][box] = dis.calc(a[box].copy(), b[box].copy(), None)
-            flows[1, t][box] = dis.calc(b[box].copy(), a[box].copy(), None)
-    return list(flows[0]), list(flows[1])
+    return dis
 
 
 def _without_background(grey: UInt8[ndarray, "h w"], mask: Bool[ndarray, "h w"]) -> UInt8[ndarray, "h w"]:
