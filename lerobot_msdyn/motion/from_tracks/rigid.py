@@ -7,12 +7,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lerobot_msdyn.core.geometry import invert_se3, transform_points, weighted_procrustes
+from lerobot_msdyn.motion.from_tracks.sweep import swept
 
 MIN_EFFECTIVE = 5.0  # tracks that a frame needs for its motion to be accepted: (sum w)² / sum w²
-_IRLS_STEPS = 5
 _NORMAL_MAD = 1.4826  # standard deviations in the median absolute deviation of a normal distribution
 _NOISE_FLOOR = 1e-4  # of the group's extent: the smallest scale of the robust weights
-_MODEL_MEMORY = 10  # observations that a model point averages while the clip is swept
 
 
 @dataclass(frozen=True)
@@ -95,71 +94,8 @@ def _sweep(
     carry: Float[Tensor, "h t 4 4"] | None,
 ) -> RigidFit:
     """First motions: outward from each group's fullest frame, every frame against the model so far."""
-    groups, _, frames = weights.shape
-    every, floor = torch.arange(groups), _floor(xyz, weights)
     reference = (weights > 0).sum(1).argmax(1)
-    seen = weights[every, :, reference]
-    motions = torch.eye(4, dtype=xyz.dtype).repeat(groups, frames, 1, 1)
-    support = torch.zeros(groups, frames, dtype=xyz.dtype)
-    support[every, reference] = _effective(seen)
-    model = xyz[:, reference].transpose(0, 1).contiguous()
-    count = (seen > 0).to(xyz.dtype)
-    for direction in (1, -1):
-        last = torch.eye(4, dtype=xyz.dtype).repeat(groups, 1, 1)
-        for step in range(1, frames):
-            frame = reference + direction * step
-            rows = ((frame >= 0) & (frame < frames)).nonzero()[:, 0]
-            if len(rows) == 0:
-                break
-            at = frame[rows]
-            target = xyz[:, at].transpose(0, 1)
-            seen = weights[rows, :, at]
-            usable = seen * (count[rows] > 0)
-            if carry is not None:
-                last[rows] = carry[rows, at] @ invert_se3(carry[rows, at - direction]) @ last[rows]
-            motion, effective = _register(model[rows], target, usable, floor[rows], last[rows])
-            accepted = effective >= min_effective
-            if carry is not None:
-                accepted, motion = _or_carried(accepted, motion, last[rows], seen, min_effective)
-            last[rows] = torch.where(accepted[:, None, None], motion, last[rows])
-            motions[rows, at] = last[rows]
-            support[rows, at] = torch.where(accepted, effective.clamp(min=1e-6), 0.0)
-            new = (seen > 0) & accepted[:, None]
-            rate = (new / (count[rows] + 1))[..., None]
-            model[rows] += rate * (transform_points(invert_se3(last[rows]), target) - model[rows])
-            count[rows] = (count[rows] + new).clamp(max=_MODEL_MEMORY)
-    return RigidFit(motions, support)
-
-
-def _or_carried(
-    accepted: Bool[Tensor, " h"],
-    motion: Float[Tensor, "h 4 4"],
-    carried: Float[Tensor, "h 4 4"],
-    seen: Float[Tensor, "h n"],
-    min_effective: float,
-) -> tuple[Bool[Tensor, " h"], Float[Tensor, "h 4 4"]]:
-    """Where the model is not seen but enough other tracks are, take the carrier's word."""
-    restart = ~accepted & (_effective(seen) >= min_effective)
-    return accepted | restart, torch.where(restart[:, None, None], carried, motion)
-
-
-def _register(
-    source: Float[Tensor, "h n 3"],
-    target: Float[Tensor, "h n 3"],
-    weights: Float[Tensor, "h n"],
-    floor: Float[Tensor, " h"],
-    motion: Float[Tensor, "h 4 4"],
-) -> tuple[Float[Tensor, "h 4 4"], Float[Tensor, " h"]]:
-    """Robust rigid motions, starting from a guess, and the effective number of points behind each.
-
-    The guess is that of the neighbouring frame: what follows the body is near it, what does not need not be.
-    """
-    robust = weights
-    for _ in range(_IRLS_STEPS):
-        distance = (transform_points(motion, source) - target).norm(dim=-1)
-        robust = _robust_weights(distance, weights, floor)
-        motion = weighted_procrustes(source, target, robust)
-    return motion, _effective(robust)
+    return RigidFit(*swept(xyz, weights, reference, _floor(xyz, weights), min_effective, carry))
 
 
 def _robust_weights(
