@@ -136,6 +136,11 @@ def nearest_rotation(matrices: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*b
 
     Solved in float64: single precision loses the smallest singular vectors of thin sets.
     """
+    if not (matrices.is_cuda or matrices.requires_grad):
+        from lerobot_msdyn.core.rotations import nearest_rotations  # takes a while to import
+
+        flat = matrices.double().reshape(-1, 3, 3).contiguous().numpy()
+        return torch.from_numpy(nearest_rotations(flat)).reshape(matrices.shape).to(matrices.dtype)
     u, _, vt = torch.linalg.svd(matrices.double())
     sign = torch.ones(*matrices.shape[:-1], dtype=torch.float64, device=matrices.device)
     sign[..., 2] = torch.linalg.det(u @ vt).sign()

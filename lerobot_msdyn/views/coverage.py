@@ -13,7 +13,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.core.geometry import pixel_grid, transform_points, unproject
+from lerobot_msdyn.core.geometry import transform_points, unproject, unproject_image
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.reconstruction.evidence import Evidence, still_frames
 from lerobot_msdyn.scene.rendering import Rendering
@@ -100,6 +100,10 @@ def _points(
     depth: Float[Tensor, "h w"], camera: CameraTrack, which: Bool[Tensor, "h w"] | None = None
 ) -> Float[Tensor, "n 3"]:
     """What the pixels, or some of them, show (m, world) through the first pose of a camera."""
-    which = torch.ones_like(depth, dtype=torch.bool) if which is None else which
-    in_camera = unproject(pixel_grid(*depth.shape, depth.device)[which], depth[which], camera.intrinsics[0])
+    if which is None:
+        in_camera = unproject_image(depth, camera.intrinsics[0]).reshape(-1, 3)
+    else:
+        row, column = which.nonzero(as_tuple=True)
+        xy = torch.stack((column, row), dim=-1) + 0.5
+        in_camera = unproject(xy, depth[row, column], camera.intrinsics[0])
     return transform_points(camera.world_from_camera[0], in_camera)

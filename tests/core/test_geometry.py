@@ -91,6 +91,19 @@ def test_a_quaternion_and_its_conjugate_undo_each_other() -> None:
     torch.testing.assert_close(g.quaternion_multiply(quats, g.quaternion_conjugate(quats)), expected)
 
 
+@pytest.mark.parametrize("spread", [(1.0, 1.0, 1.0), (1.0, 0.5, 1e-3), (1.0, 1e-2, 0.0), (2.0, 1.0, -0.3)])
+def test_nearest_rotation_is_that_of_singular_vectors(spread: tuple[float, float, float]) -> None:
+    """The compiled route against the other one, also for flat, thin and reflected sets."""
+    turns = torch.linalg.qr(torch.randn(2, 50, 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)))[
+        0
+    ]
+    left, right = turns * torch.linalg.det(turns).sign()[..., None, None]
+    matrices = left @ torch.diag(torch.tensor(spread, dtype=torch.float64)) @ right.transpose(1, 2)
+    found, expected = g.nearest_rotation(matrices), g.nearest_rotation(matrices.requires_grad_()).detach()
+    torch.testing.assert_close(found, expected, atol=1e-9, rtol=0)
+    torch.testing.assert_close(found, left @ right.transpose(1, 2), atol=1e-9, rtol=0)
+
+
 def test_nearest_pixels() -> None:
     row, column = g.nearest_pixel(torch.tensor([[0.0, 0.0], [2.99, 1.01], [-0.3, 7.0], [3.0, -9.0]]), 3, 2)
     assert (row.tolist(), column.tolist()) == ([0, 1, 1, 0], [0, 2, 0, 2])

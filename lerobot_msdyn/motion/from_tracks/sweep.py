@@ -12,14 +12,13 @@ from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.core.compiled import compiled, inlined
+from lerobot_msdyn.core.rotations import rotate_nearest
 from lerobot_msdyn.render.cpu.simd import take_ticket
 from lerobot_msdyn.render.cpu.threads import run
 
 _IRLS_STEPS = 5
 _NORMAL_MAD = 1.4826  # standard deviations in the median absolute deviation of a normal distribution
 _MODEL_MEMORY = 10  # observations that a model point averages while the clip is swept
-_JACOBI_SWEEPS = 12  # of which four or five are used
-_NEXT = (1, 2, 0)
 
 
 def swept(
@@ -64,48 +63,10 @@ def _effective(weights: ndarray) -> float:
 
 
 @inlined
-def _quaternion_of_largest(a: ndarray, v: ndarray) -> int:
-    """Jacobi's method on a symmetric 4x4 matrix, in place: the column of `v` that belongs to its largest eigenvalue."""
-    v[:] = 0.0
-    for i in range(4):
-        v[i, i] = 1.0
-    for _ in range(_JACOBI_SWEEPS):
-        off, size = 0.0, 0.0
-        for i in range(4):
-            size += a[i, i] * a[i, i]
-            for j in range(i + 1, 4):
-                off += a[i, j] * a[i, j]
-        if off <= 1e-34 * size:
-            break
-        for p in range(3):
-            for q in range(p + 1, 4):
-                if a[p, q] == 0.0:
-                    continue
-                theta = (a[q, q] - a[p, p]) / (2 * a[p, q])
-                t = (1.0 if theta >= 0 else -1.0) / (abs(theta) + math.sqrt(theta * theta + 1))
-                c = 1 / math.sqrt(t * t + 1)
-                s = t * c
-                for k in range(4):
-                    x, y = a[k, p], a[k, q]
-                    a[k, p], a[k, q] = c * x - s * y, s * x + c * y
-                for k in range(4):
-                    x, y = a[p, k], a[q, k]
-                    a[p, k], a[q, k] = c * x - s * y, s * x + c * y
-                for k in range(4):
-                    x, y = v[k, p], v[k, q]
-                    v[k, p], v[k, q] = c * x - s * y, s * x + c * y
-    best = 0
-    for i in range(1, 4):
-        if a[i, i] > a[best, best]:
-            best = i
-    return best
-
-
-@inlined
 def _procrustes(
     source: ndarray, target: ndarray, weights: ndarray, a: ndarray, v: ndarray, sums: ndarray, motion: ndarray
 ) -> None:
-    """The rigid motion that best carries `source` onto `target` (Horn 1987), into `motion` [4,4]."""
+    """The rigid motion that best carries `source` onto `target`, into `motion` [4,4]."""
     total = 0.0
     mean = np.zeros((2, 3))
     for i in range(len(weights)):
@@ -115,27 +76,15 @@ def _procrustes(
             mean[1, axis] += weights[i] * target[i, axis]
     total = max(total, 1e-12)
     mean /= total
-    sums[:] = 0.0  # source axis, target axis
+    sums[:] = 0.0
     for i in range(len(weights)):
         if weights[i] == 0.0:
             continue
         for row in range(3):
-            off = weights[i] / total * (source[i, row] - mean[0, row])
+            off = weights[i] / total * (target[i, row] - mean[1, row])
             for column in range(3):
-                sums[row, column] += off * (target[i, column] - mean[1, column])
-    trace = sums[0, 0] + sums[1, 1] + sums[2, 2]
-    a[0, 0] = trace
-    for i in range(3):
-        j, k = _NEXT[i], _NEXT[_NEXT[i]]
-        a[0, i + 1] = a[i + 1, 0] = sums[j, k] - sums[k, j]
-        a[i + 1, i + 1] = 2 * sums[i, i] - trace
-        a[i + 1, j + 1] = a[j + 1, i + 1] = sums[i, j] + sums[j, i]
-    best = _quaternion_of_largest(a, v)
-    w, x, y, z = v[0, best], v[1, best], v[2, best], v[3, best]
-    s = 2 / (w * w + x * x + y * y + z * z)
-    motion[0, 0], motion[0, 1], motion[0, 2] = 1 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)
-    motion[1, 0], motion[1, 1], motion[1, 2] = s * (x * y + w * z), 1 - s * (x * x + z * z), s * (y * z - w * x)
-    motion[2, 0], motion[2, 1], motion[2, 2] = s * (x * z - w * y), s * (y * z + w * x), 1 - s * (x * x + y * y)
+                sums[row, column] += off * (source[i, column] - mean[0, column])
+    rotate_nearest(sums, a, v, motion)
     for row in range(3):
         motion[row, 3] = mean[1, row]
         for axis in range(3):
