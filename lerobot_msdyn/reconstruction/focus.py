@@ -6,7 +6,7 @@ What stands still is the same at every frame, so that the steps between, which l
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from lerobot_msdyn.core.config import FitConfig
@@ -46,6 +46,7 @@ class Focus:
             moving[row, column] = 1
             regions.append(torch.from_numpy(cv2.dilate(moving, window) > 0))
         self._regions = torch.stack(regions).to(device)
+        self._shown: dict[int, Int[Tensor, " n"]] = {}  # by frame, the static Gaussians that its region may show
 
     @classmethod
     def wanted(cls, config: FitConfig, view: View, priors: Priors) -> bool:
@@ -65,6 +66,9 @@ class Focus:
         On a GPU all of the scene is rendered, without waiting for what can be left out.
         """
         region = self._regions[frame]
-        on_host = region.device.type == "cpu"
-        rows = self._still.may_cover(region.numpy()).nonzero()[:, 0] if on_host else slice(None)
+        rows: Tensor | slice = slice(None)
+        if region.device.type == "cpu":
+            if frame not in self._shown:
+                self._shown[frame] = self._still.may_cover(region.numpy()).nonzero()[:, 0]
+            rows = self._shown[frame]
         return scene.select_static(rows), region[None]
