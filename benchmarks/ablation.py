@@ -8,7 +8,7 @@
 Every row is fitted to the same videos with the same priors (recorded depth, the project's own masks and tracks, or the
 true ones), number of steps, losses and rasterizer, and rendered from held-out cameras. FILE gets a row's figures as
 soon as they are known; what it holds already is not measured again, so a run that was stopped goes on. `--report`
-prints the table of what FILE holds and plots it as docs/images/ablation.svg.
+prints the table of what FILE holds and, if L1-L3 is in it, plots it as docs/images/ablation.svg.
 
 PSNR (dB) of a picture is over the pixels that the recorded camera has seen at some time (`all`), those of bodies that
 move (`moving`), and those it saw only at another time (`disoccluded`); figures are means over cameras and frames.
@@ -37,7 +37,7 @@ from typing import Any
 import numpy as np
 import rivals
 import torch
-from ablation_report import overview_table, plot, scene_table
+from ablation_report import REFERENCE, overview_table, plot, scene_table
 from ablation_rivals import warped_pictures, with_fixed_field, with_learned_field
 from ablation_scenes import Case, HeldOut, simulated_case, synthetic_case
 from jaxtyping import UInt8
@@ -305,7 +305,7 @@ def main(arguments: list[str]) -> None:
         help="; between them, or: paper",
     )
     parser.add_argument("--json", type=Path, default=JSON)
-    parser.add_argument("--report", action="store_true", help="print the table of the figures, and plot them")
+    parser.add_argument("--report", action="store_true", help="print tables of the figures, and plot them")
     for name, value in asdict(Settings()).items():
         parser.add_argument(f"--{name}", type=int, default=value)
     options = parser.parse_args(arguments)
@@ -314,7 +314,8 @@ def main(arguments: list[str]) -> None:
     if options.report:
         figures = read(options.json, settings)
         print(overview_table(figures, options.scenes), scene_table(figures), sep="\n\n")
-        write_whole(PLOT, plot(figures, options.scenes).encode())
+        if any(figure["row"] == REFERENCE for figure in figures):
+            write_whole(PLOT, plot(figures, options.scenes).encode())
     else:
         with torch_on_one_thread():
             run(options, settings)

@@ -24,10 +24,11 @@ def overview_table(figures: Figures, simulated: Iterable[str]) -> str:
     synthetic = [one for one in figures if one["scene"] not in simulated]
     others = [one for one in figures if one["scene"] in simulated]
     kinds, seeds = _values(synthetic, "scene"), _values(synthetic, "seed")
-    head = [f"synthetic: {name}" for name in MEASURES] + [f"simulated: {name}" for name in MEASURES] * bool(others)
+    head = [f"synthetic: {name}" for name in MEASURES] * bool(synthetic)
+    head += [f"simulated: {name}" for name in MEASURES] * bool(others)
     lines = [f"| | {' | '.join(head)} |", "|---" * (len(head) + 1) + "|"]
     for row in _values(figures, "row"):
-        cells = [_over_seeds(synthetic, row, name, kinds, seeds) for name in MEASURES]
+        cells = [_over_seeds(synthetic, row, name, kinds, seeds) for name in MEASURES] if synthetic else []
         cells += [_mean(others, row, name, _values(others, "scene")) for name in MEASURES] if others else []
         lines.append(f"| {row} | {' | '.join(cells)} |")
     return "\n".join(lines)

@@ -183,6 +183,13 @@ def test_a_row_that_is_not_finished_stays_empty(report: ModuleType) -> None:
     assert table.splitlines()[3].endswith("|  |  |  |")
 
 
+def test_simulated_scenes_alone_have_no_columns_of_others(report: ModuleType) -> None:
+    simulated = [one for one in figures() if one["scene"] == "real <arm>"]
+    lines = report.overview_table(simulated, ["real <arm>"]).splitlines()
+    assert lines[0] == "| | simulated: all | simulated: moving | simulated: disoccluded |"
+    assert lines[2] == "| L1 | 20.00 | 20.00 | 20.00 |"
+
+
 def test_the_plot_has_a_dot_for_every_case(report: ModuleType) -> None:
     picture = ElementTree.fromstring(report.plot(figures(), ["real <arm>"]))
     circles = picture.findall("{http://www.w3.org/2000/svg}circle")
