@@ -97,7 +97,7 @@ def test_the_rows_of_the_paper_change_one_thing_each_of_its_recipe(ablation: Mod
     settings = ablation.Settings(steps=7, width=64)
     recipes = {row.name: asdict(ablation.recipe_of(row, settings, 1)) for row in ablation.PAPER_ROWS}
     whole = recipes["paper: L1-L3"]
-    assert whole["fit"]["learn"] == {"bases": True, "weights": True, "begin": 0, "sure_px": 0}
+    assert whole["fit"]["learn"] == {"bases": True, "weights": True, "poses": True, "begin": 0, "sure_px": 0}
     assert whole["fit"]["density"]["enabled"]
     assert (whole["fit"]["steps"], whole["fit"]["max_width"], whole["seed"]) == (7, 64, 1)
     changed = {
