@@ -53,6 +53,7 @@ Run = Callable[[Callable[[LeRobotDatasetMetadata, Any], Any], list[Any]], Iterab
 
 READING = 0.2  # share of the time that reading takes
 WORTH = 0.2  # of an episode's whole work, that looking at one of the background's takes
+WORTH_SHOWN = 0.5  # the same where a camera moves
 
 
 def seen_together(
@@ -63,9 +64,11 @@ def seen_together(
     say: Callable[[str, float], object] = lambda what, share: None,
 ) -> Backgrounds:
     """`shown_backgrounds` of cameras that move, with poses that can be compared; `shared_backgrounds` of the others."""
+    if not recipe.camera.known_before:
+        return shared_backgrounds(source, cameras, recipe, run, say)
     shown = shown_backgrounds(source, cameras, recipe, run, say)
-    others = [key for key in cameras if not shown.get(key)]
-    shared = shared_backgrounds(source, others, recipe, run, say) if others else {}
+    others = [key for key in cameras if not shown[key]]
+    shared = shared_backgrounds(source, others, recipe, run, lambda what, _: say(what, 0.0)) if others else {}
     return {**shared, **{key: found for key, found in shown.items() if found}}
 
 
@@ -126,10 +129,8 @@ def shown_backgrounds(
 ) -> dict[str, list[Shown]]:
     """Per camera that moves, with poses in a world that episodes share, what each of some of them shows.
 
-    Nothing, without looking at any episode, where poses are not known before. Arguments as for `shared_backgrounds`.
+    Arguments as for `shared_backgrounds`.
     """
-    if not recipe.camera.known_before:
-        return {}
     tasks = [ShownTask(index, key, recipe) for key in cameras for index in background_episodes(source, recipe)]
     look = functools.partial(shown_in_episode, source)
     found: dict[str, list[Shown]] = {key: [] for key in cameras}
@@ -164,15 +165,15 @@ def moving_in_episode(source: LeRobotDatasetMetadata, task: MaskTask) -> UInt8[n
 
 
 def background_episodes(source: LeRobotDatasetMetadata, recipe: Recipe) -> list[int]:
-    """The episodes that `shared_backgrounds` looks at."""
+    """The episodes that `seen_together` looks at."""
     if not recipe.scene.shared_background or source.total_episodes < 2 or recipe.scenes is not None:
         return []
     return looked_at(source.total_episodes)
 
 
 def background_worth(source: LeRobotDatasetMetadata, recipe: Recipe) -> float:
-    """As many episodes as what `shared_backgrounds` takes as long as, about."""
-    return WORTH * len(background_episodes(source, recipe))
+    """As many episodes as what `seen_together` takes as long as, about."""
+    return (WORTH_SHOWN if recipe.camera.known_before else WORTH) * len(background_episodes(source, recipe))
 
 
 def looked_at(episodes: int) -> list[int]:

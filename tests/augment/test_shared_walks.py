@@ -52,7 +52,7 @@ def walks(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def command(walks: Path, out: Path, *more: str, kind: str = "shared") -> list[str]:
     """New views from 14 degrees further on than the first episode was recorded."""
     recorded, aside = (walking_camera(3, WIDTH, HEIGHT, (ARCS[0][0] + by, ARCS[0][1] + by)) for by in (0, 14))
-    pose = (recorded.camera_from_world.double() @ aside.world_from_camera.double())[1, :3].reshape(-1).tolist()
+    pose = (aside.camera_from_world.double() @ recorded.world_from_camera.double())[1, :3].reshape(-1).tolist()
     source = ["--repo", "local/walks", "--root", str(walks / "walks"), "--new_root", str(out), "--episodes", "[0]"]
     file = f"{walks}/{kind}/{{episode}}.npz"
     camera = ["--allow_moving", "true", "--camera.poses", file, "--priors.masks", file, "--workers", "1"]
