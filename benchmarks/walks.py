@@ -25,6 +25,7 @@ from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.priors.exchange import Exchange, write_exchange
 from lerobot_msdyn.reconstruction.reconstruct import reconstruct
 from lerobot_msdyn.reconstruction.share_background import shown_by
+from lerobot_msdyn.render.cpu.threads import torch_on_one_thread
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.scene import SyntheticScene
 from lerobot_msdyn.synthetic.viewpoints import walking_camera
@@ -65,11 +66,10 @@ def measured(seed: int, recipe: Recipe, options: argparse.Namespace) -> list[dic
     """The figures of one seed, a row per view."""
     recipe = replace(recipe, camera=replace(recipe.camera, poses=f"{options.out}/poses_{seed}_{{episode}}.npz"))
     scene, view = recorded(seed, 0, OWN, options)
+    recordings = {episode: recorded(seed, episode, OTHERS, options)[1] for episode in range(1, options.others + 1)}
     start = time.process_time()
-    others = [
-        shown_by(recorded(seed, episode, OTHERS, options)[1], recipe, episode, KEY)
-        for episode in range(1, options.others + 1)
-    ]
+    with torch_on_one_thread():
+        others = [shown_by(view, recipe, episode, KEY) for episode, view in recordings.items()]
     offered_s = (time.process_time() - start) / max(1, options.others)
     backgrounds = [other for other in others if other is not None]
     runs = []
@@ -79,7 +79,7 @@ def measured(seed: int, recipe: Recipe, options: argparse.Namespace) -> list[dic
         runs.append((found, time.process_time() - start))
     rows = []
     for name, aside in (("on", ASIDE), ("back", -ASIDE)):
-        camera = walking_camera(options.frames, *view.rgb.shape[2:0:-1], (OWN[0] + aside, OWN[1] + aside))
+        camera = walking_camera(options.frames, view.camera.width, view.camera.height, (OWN[0] + aside, OWN[1] + aside))
         frames = list(range(0, options.frames, 3))
         camera, truth = camera.select(frames), scene.render(camera.select(frames), frames)
         pictures = [[*new_pictures(found, camera, torch.tensor(frames))] for found, _ in runs]
@@ -87,9 +87,10 @@ def measured(seed: int, recipe: Recipe, options: argparse.Namespace) -> list[dic
         still = (truth.instances == 0).numpy()
         shown = {"own": ~unseen[0] & still, "new": unseen[0] & ~unseen[1] & still, "all": still}
         row = {"seed": seed, "on": float(name == "on"), "offered cpu s": offered_s}
-        for kind, some, hidden, (_, seconds) in zip(("alone", "shared"), pictures, unseen, runs, strict=True):
+        for kind, some, hidden, (found, seconds) in zip(("alone", "shared"), pictures, unseen, runs, strict=True):
             row[f"{kind} uncovered %"] = 100 * hidden.mean()
             row[f"{kind} cpu s"] = seconds
+            row[f"{kind} background s"] = found.seconds["background"]
             error = np.square(np.stack([picture.rgb for picture in some]) / 255.0 - truth.rgb.numpy() / 255.0).mean(-1)
             for where, mask in shown.items():
                 row[f"{kind} {where} dB"] = -10 * np.log10(error[mask].mean()) if mask.any() else np.nan
