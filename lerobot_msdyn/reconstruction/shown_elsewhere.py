@@ -35,8 +35,8 @@ REACH = 0.5  # of a picture's size, by which surfaces may lie beside it and stil
 REACHING = 8  # frames by which that is judged
 LEAST_BOTH = 0.05  # share of a picture that two episodes must both show for them to be compared
 # Share of it that must agree. On simulated desks, 320 px wide: 0.98 where both episodes are of one kind, 0.87 to 0.89
-# where an arm rests in one alone; 0.91, 0.79 and 0.66 where poses are 3, 10 and 30 mm beside (0.4, 1.4 and 4 % of the distance)
-# and are not refined; 0.20 to 0.66 where the desk is laid otherwise.
+# where an arm rests in one alone; 0.91, 0.79 and 0.66 where poses are 3, 10 and 30 mm beside (0.4, 1.4 and 4 % of the
+# distance) and are not refined; 0.20 to 0.66 where the desk is laid otherwise.
 AGREEING = 0.83
 BLUR_PX = 1.5  # of 320: colours are compared after it, since fine texture lies half a pixel beside
 ALIKE_GREY_LEVELS = 20.0  # difference up to which colours are alike, after the gain

@@ -81,6 +81,17 @@ def test_surfaces_from_elsewhere_are_where_they_are_in_truth(
         assert off[known].median() < 0.01
 
 
+def test_a_thing_that_stood_there_alone_is_left_out(here: Walked, keys: tuple[KeyView, ...], there: Shown) -> None:
+    depth, rgb = there.depth.clone(), there.rgb.clone()
+    depth[0, 30:44, 30:50] *= 0.7  # a card before the desk, red
+    rgb[0, 30:44, 30:50] = torch.tensor([250, 0, 0], dtype=torch.uint8)
+    found = with_shown(keys, here[1], [replace(there, depth=depth, rgb=rgb)])
+    assert len(found) > len(keys)
+    for key in found:
+        red = (key.empty.rgb[..., 0] > 200) & (key.empty.rgb[..., 1:].amax(-1) < 40) & (key.empty.seen > 0)
+        assert red.sum() < 5
+
+
 def test_brightness_may_differ_by_a_gain(here: Walked, keys: tuple[KeyView, ...], there: Shown) -> None:
     darker = replace(there, rgb=(there.rgb.float() * 0.7).round().to(torch.uint8))
     bright, dark = (with_shown(keys, here[1], [other]) for other in (there, darker))
