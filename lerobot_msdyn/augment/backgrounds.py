@@ -19,13 +19,14 @@ from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import EpisodeError, PriorError
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.reconstruction.pooled_background import MAX_EPISODES, SharedBackground, few
-from lerobot_msdyn.reconstruction.share_background import moving_in_few, share_backgrounds
+from lerobot_msdyn.reconstruction.share_background import moving_in_few, share_backgrounds, shown_by
+from lerobot_msdyn.reconstruction.shown_elsewhere import Shown
 from lerobot_msdyn.reconstruction.windows import stands_of, whole_stands
 from lerobot_msdyn.render.cpu.threads import in_threads, torch_on_one_thread
 
 logger = logging.getLogger(__name__)
 
-Backgrounds = Mapping[str, Sequence[SharedBackground]]  # by camera
+Backgrounds = Mapping[str, Sequence[SharedBackground | Shown]]  # by camera
 
 
 @dataclass(frozen=True)
@@ -39,10 +40,36 @@ class MaskTask:
     frames: UInt8[ndarray, "m h w 3"]  # of all that are looked at
 
 
-Run = Callable[[Callable[[LeRobotDatasetMetadata, MaskTask], Any], list[MaskTask]], Iterable[Any]]
+@dataclass(frozen=True)
+class ShownTask:
+    """What an episode shows of what stands still, where a camera moves: what is asked of `shown_in_episode`."""
+
+    episode: int
+    key: str
+    recipe: Recipe
+
+
+Run = Callable[[Callable[[LeRobotDatasetMetadata, Any], Any], list[Any]], Iterable[Any]]
 
 READING = 0.2  # share of the time that reading takes
 WORTH = 0.2  # of an episode's whole work, that looking at one of the background's takes
+WORTH_SHOWN = 0.5  # the same where a camera moves
+
+
+def seen_together(
+    source: LeRobotDatasetMetadata,
+    cameras: list[str],
+    recipe: Recipe,
+    run: Run | None = None,
+    say: Callable[[str, float], object] = lambda what, share: None,
+) -> Backgrounds:
+    """`shown_backgrounds` of cameras that move, with poses that can be compared; `shared_backgrounds` of the others."""
+    if not recipe.camera.known_before:
+        return shared_backgrounds(source, cameras, recipe, run, say)
+    shown = shown_backgrounds(source, cameras, recipe, run, say)
+    others = [key for key in cameras if not shown[key]]
+    shared = shared_backgrounds(source, others, recipe, run, lambda what, _: say(what, 0.0)) if others else {}
+    return {**shared, **{key: found for key, found in shown.items() if found}}
 
 
 def shared_backgrounds(
@@ -51,7 +78,7 @@ def shared_backgrounds(
     recipe: Recipe,
     run: Run | None = None,
     say: Callable[[str, float], object] = lambda what, share: None,
-) -> Backgrounds:
+) -> dict[str, list[SharedBackground]]:
     """Per camera, what some of its episodes show together, fitted once; one for every place in which it stood.
 
     Episodes that cannot be read are left out here, and reported when it is their turn. `run` calls a function with the
@@ -93,6 +120,38 @@ def shared_backgrounds(
     return backgrounds
 
 
+def shown_backgrounds(
+    source: LeRobotDatasetMetadata,
+    cameras: list[str],
+    recipe: Recipe,
+    run: Run | None = None,
+    say: Callable[[str, float], object] = lambda what, share: None,
+) -> dict[str, list[Shown]]:
+    """Per camera that moves, with poses in a world that episodes share, what each of some of them shows.
+
+    Arguments as for `shared_backgrounds`.
+    """
+    tasks = [ShownTask(index, key, recipe) for key in cameras for index in background_episodes(source, recipe)]
+    look = functools.partial(shown_in_episode, source)
+    found: dict[str, list[Shown]] = {key: [] for key in cameras}
+    for task, shown in zip(tasks, map(look, tasks) if run is None else run(shown_in_episode, tasks), strict=True):
+        say(f"background: what episode {task.episode} shows is known", 1 / len(tasks))
+        if shown is not None:
+            found[task.key].append(shown)
+    return found
+
+
+def shown_in_episode(source: LeRobotDatasetMetadata, task: ShownTask) -> Shown | None:
+    """What an episode shows to others; None where its camera stands still, or its poses are in a world of its own."""
+    try:
+        view = read_recorded(source, task.episode, [task.key], task.recipe)[0].views[task.key]
+        with torch_on_one_thread():
+            return shown_by(view, task.recipe, task.episode, task.key)
+    except (EpisodeError, PriorError) as error:  # reported when it is this episode's turn, if it is worked on
+        logger.warning("shared background: episode %d is left out: %s", task.episode, error)
+        return None
+
+
 def moving_in_episode(source: LeRobotDatasetMetadata, task: MaskTask) -> UInt8[ndarray, "t h w"]:
     """What moves in those frames of a stretch that `few_frames` takes; everything, where no masks can be had."""
     view = read_recorded(source, task.episode, [task.key], task.recipe, recorded_depth=False)[0].views[task.key]
@@ -106,15 +165,15 @@ def moving_in_episode(source: LeRobotDatasetMetadata, task: MaskTask) -> UInt8[n
 
 
 def background_episodes(source: LeRobotDatasetMetadata, recipe: Recipe) -> list[int]:
-    """The episodes that `shared_backgrounds` looks at."""
+    """The episodes that `seen_together` looks at."""
     if not recipe.scene.shared_background or source.total_episodes < 2 or recipe.scenes is not None:
         return []
     return looked_at(source.total_episodes)
 
 
 def background_worth(source: LeRobotDatasetMetadata, recipe: Recipe) -> float:
-    """As many episodes as what `shared_backgrounds` takes as long as, about."""
-    return WORTH * len(background_episodes(source, recipe))
+    """As many episodes as what `seen_together` takes as long as, about."""
+    return (WORTH_SHOWN if recipe.camera.known_before else WORTH) * len(background_episodes(source, recipe))
 
 
 def looked_at(episodes: int) -> list[int]:

@@ -240,17 +240,21 @@ def predicted_background_seconds(
     indices = background_episodes(source, recipe)
     if not indices:
         return 0.0
+    per_frame = source.total_frames / source.total_episodes
+    if recipe.camera.known_before:  # each shows what it has; a camera that stands still is taken for one that moves
+        return len(indices) * (speeds.read_s + speeds.prepare_s) / workers * per_frame
     apart = len(set(indices) - set(episodes))  # the masks of the others serve for their own fit as well
     masks_s = (len(indices) * speeds.read_s + apart * MASKS_SHARE * speeds.prepare_s) / workers
     each_s = len(indices) * speeds.read_s + masks_s
-    return each_s * source.total_frames / source.total_episodes + recipe.fit.steps / 2 * speeds.step_s
+    return each_s * per_frame + recipe.fit.steps / 2 * speeds.step_s
 
 
 def predicted_episode_seconds(
     speeds: Speeds, source: LeRobotDatasetMetadata, episodes: list[int], recipe: Recipe, workers: int = 1
 ) -> float:
     """The part of it for episodes, some of a run's."""
-    steps = recipe.fit.steps * (FURTHER_STEPS if background_episodes(source, recipe) else 1.0)
+    fitted_before = background_episodes(source, recipe) and not recipe.camera.known_before
+    steps = recipe.fit.steps * (FURTHER_STEPS if fitted_before else 1.0)
     busy_s = [0.0] * workers
     for index in episodes:
         frames = int(source.episodes[index]["length"])

@@ -58,7 +58,7 @@ def augment_episode(
     progress: Progress = lambda what, share: None,
     backgrounds: Backgrounds | None = None,
 ) -> list[NewEpisode]:
-    """All new episodes of one source episode, staged in the output; `backgrounds` come from `shared_backgrounds`.
+    """All new episodes of one source episode, staged in the output; `backgrounds` come from `seen_together`.
 
     What an earlier run has finished of it is taken from the output's work folder.
 

@@ -22,6 +22,7 @@ from lerobot_msdyn.priors.exchange import Exchange, write_exchange
 from lerobot_msdyn.robots.calibration.hand_eye import HandEye, solve_hand_eye
 from lerobot_msdyn.robots.kinematics import link_poses
 
+WORLD = "robot"  # its root, in all episodes
 FRAMES = 400  # of each episode that is looked at, from its first one
 
 
@@ -53,7 +54,9 @@ class RidingCamera:
         for index, links in self.world_from_link.items():
             poses = np.linalg.inv(self.eye.poses(links, self.fps)).astype(np.float32)
             path = folder / f"episode_{index:06d}" / f"{self.key}.npz"
-            content = Exchange(len(poses), height, width, index, self.key, K=np.tile(K, (len(poses), 1, 1)), w2c=poses)
+            content = Exchange(
+                len(poses), height, width, index, self.key, K=np.tile(K, (len(poses), 1, 1)), w2c=poses, world=WORLD
+            )
             write_exchange(path, content)
             yield path
 

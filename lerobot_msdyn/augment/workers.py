@@ -21,7 +21,7 @@ import torch
 from lerobot.datasets import LeRobotDatasetMetadata
 from tqdm import tqdm
 
-from lerobot_msdyn.augment.backgrounds import Backgrounds, MaskTask, Run, background_worth, shared_backgrounds
+from lerobot_msdyn.augment.backgrounds import Backgrounds, Run, background_worth, seen_together
 from lerobot_msdyn.augment.config import AugmentConfig
 from lerobot_msdyn.augment.episode import Progress
 from lerobot_msdyn.core.cli import quiet_libraries
@@ -57,7 +57,7 @@ class Work:
 
         def make() -> Backgrounds:
             worth = background_worth(self.source, self.config)
-            return shared_backgrounds(
+            return seen_together(
                 self.source, self.cameras, self.config, self.run, lambda what, share: self.progress(what, share * worth)
             )
 
@@ -147,9 +147,7 @@ class Workers(Processes[Work]):
     def __init__(self, count: int, work: Work) -> None:
         super().__init__(count, functools.partial(_begin, _place_of(work), _share_of_threads(count)), work.progress)
 
-    def moving(
-        self, function: Callable[[LeRobotDatasetMetadata, MaskTask], object], tasks: list[MaskTask]
-    ) -> Iterator[object]:
+    def moving(self, function: Callable[[LeRobotDatasetMetadata, Any], object], tasks: list[Any]) -> Iterator[object]:
         """The same as `map` for a function of the source."""
         return self.map(_with_source, [(function, task) for task in tasks])
 
@@ -191,6 +189,6 @@ def _talkative(config: AugmentConfig) -> list[logging.Logger]:
     return [] if config.verbose else [logging.getLogger(f"lerobot_msdyn.{name}") for name in STAGES]
 
 
-def _with_source(work: Work, call: tuple[Callable[[LeRobotDatasetMetadata, MaskTask], object], MaskTask]) -> object:
+def _with_source(work: Work, call: tuple[Callable[[LeRobotDatasetMetadata, Any], object], Any]) -> object:
     function, task = call
     return function(work.source, task)

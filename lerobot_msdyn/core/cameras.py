@@ -20,6 +20,7 @@ class CameraTrack:
     width: int
     height: int
     origin: str = "assumed"  # or: calibration, exchange, sfm, fov_search
+    world: str = ""  # name of the frame of its poses, which videos with the same name share; empty: this video's own
 
     def __len__(self) -> int:
         return self.intrinsics.shape[0]

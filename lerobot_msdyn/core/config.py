@@ -66,6 +66,12 @@ class CameraConfig:
         """Whether the poses are found for a whole video: it cannot be fitted part by part."""
         return _needs_whole_videos(self.poses, CAMERAS)
 
+    @property
+    def known_before(self) -> bool:
+        """Whether cameras are known without their videos: poses from files, or from a provider that says so."""
+        name = self.poses.partition(PARAMETER)[0]
+        return self.poses.endswith(FILE) or (name in CAMERAS and bool(CAMERAS.get(name).known_before))
+
 
 @dataclass
 class RobotConfig:
@@ -125,7 +131,8 @@ class PriorsConfig:
 class SceneConfig:
     """How many Gaussians, and from where."""
 
-    # Whether what one episode never shows of a fixed camera's background is taken from the others.
+    # Whether what one episode never shows of what stands still is taken from the others: of a fixed camera, and of one
+    # that moves where their poses share a world.
     shared_background: bool = True
     # Upper bound for the static set (before a camera that moves: for each key view); one Gaussian per pixel of the
     # fitted image where it suffices.

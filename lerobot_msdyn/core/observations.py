@@ -75,6 +75,12 @@ class PointTracks:
     def __len__(self) -> int:
         return self.xy.shape[0]
 
+    @classmethod
+    def none(cls, frames: int) -> "PointTracks":
+        """No points at all."""
+        nothing = torch.zeros(0, frames)
+        return cls(torch.zeros(0, frames, 2), nothing.bool(), nothing, torch.zeros(0, dtype=torch.long))
+
 
 @dataclass(frozen=True)
 class BodyTracks:

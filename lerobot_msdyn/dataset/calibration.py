@@ -59,7 +59,9 @@ def read_calibration(path: Path, camera: str, episode: int, frames: int, width: 
             f"{path}: camera {camera!r} has no usable K (3x3), R (3x3), t (3): {error}; see docs/calibration.md"
         ) from error
     world_from_camera = invert_se3(se3(rotation, translation)).float()
-    return replace(static_camera(intrinsics, frames, width, height, world_from_camera), origin="calibration")
+    world = "calibration" if "R" in entry or "t" in entry else ""
+    fixed = static_camera(intrinsics, frames, width, height, world_from_camera)
+    return replace(fixed, origin="calibration", world=world)
 
 
 def read_robot(path: Path) -> RobotRecord | None:

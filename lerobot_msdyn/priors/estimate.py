@@ -111,6 +111,22 @@ def estimate_masks(
     return instances if view.robot is None else with_robot(instances, view.robot)[0]
 
 
+def known_camera(
+    view: View, config: PriorsConfig, camera: CameraConfig, *, episode: int | None = None, key: str | None = None
+) -> CameraTrack:
+    """The camera of a video by a provider that needs nothing of it (`CameraProvider.known_before`).
+
+    Raises:
+        PriorError: it cannot be had.
+    """
+    request = Request(view, config, camera, open_cache("off", view.rgb), episode=episode, key=key)
+    nothing = torch.zeros(view.rgb.shape[:3], dtype=torch.uint8)
+    found: tuple[CameraTrack, Origin] = provide(
+        CameraProvider, camera.poses, request, lambda provider: provider.estimate(request, nothing), file=CameraFile
+    )
+    return found[0]
+
+
 def _before_poses(request: Request, camera: CameraTrack, depth: Depth) -> Masks:
     """What moves before a camera that moves, by its poses and depth."""
 

@@ -44,6 +44,7 @@ class Exchange:
     query_t: Int[ndarray, " n"] | None = None  # frame in which a track was asked for
     K: Float32[ndarray, "t 3 3"] | None = None  # px
     w2c: Float32[ndarray, "t 4 4"] | None = None  # camera from world, m
+    world: str = ""  # name of w2c's world, where other files have the same; empty: it is this video's own
     provenance: dict[str, Any] = field(default_factory=dict)
 
     def model(self, prior: str) -> Model | None:
@@ -73,6 +74,7 @@ def from_priors(view: View, priors: Priors, episode: int, camera: str) -> Exchan
         query_t=tracks.visible.long().argmax(1).numpy(),
         K=pinhole.intrinsics.numpy(),
         w2c=pinhole.camera_from_world.numpy(),
+        world=pinhole.world,
         provenance=priors.provenance,
     )
 
@@ -98,6 +100,8 @@ def write_exchange(path: Path, content: Exchange) -> None:
     }
     if content.depth is not None:
         arrays["depth_kind"] = content.depth_kind
+    if content.world:
+        arrays["world"] = content.world
     arrays["frames"], arrays["size"] = content.frames, np.array([content.height, content.width])
     arrays["provenance"] = json.dumps(content.provenance)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -146,6 +150,7 @@ def read_exchange(
         plain("query_t", np.int64),
         intrinsics,
         plain("w2c", np.float32),
+        str(arrays.get("world", "")),
         _provenance(path, arrays),
     )
 

@@ -1,6 +1,7 @@
 """Providers that read an exchange file (docs/priors.md)."""
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 
@@ -40,6 +41,7 @@ class MaskFile(MaskProvider):
 class CameraFile(CameraProvider):
     """The arrays `K` and `w2c`, or one of them."""
 
+    known_before: ClassVar[bool] = True
     pattern: str
 
     def estimate(self, request: Request, instances: Masks) -> Estimate[CameraTrack]:
@@ -52,7 +54,7 @@ class CameraFile(CameraProvider):
             camera = replace(camera, intrinsics=torch.from_numpy(content.K).contiguous())
         if content.w2c is not None:
             pose = invert_se3(torch.from_numpy(content.w2c).double()).float()
-            camera = replace(camera, world_from_camera=pose)
+            camera = replace(camera, world_from_camera=pose, world=content.world)
         return Estimate(camera, model=content.model(self.prior))
 
 

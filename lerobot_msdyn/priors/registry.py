@@ -136,6 +136,10 @@ class CameraProvider(Provider):
 
     prior, setting, registry = "camera", "camera.poses", registries.CAMERAS
 
+    # Whether the camera is known without the video, as a file has it: then it is asked for, with masks in which nothing
+    # moves, before any episode is worked on, and what episodes of the same `CameraTrack.world` show is shared.
+    known_before: ClassVar[bool] = False
+
     @abstractmethod
     def estimate(self, request: Request, instances: Masks) -> Estimate[CameraTrack]:
         """The camera at every frame (OpenCV axes, m); `request.view.camera` is that of the calibration, or assumed.

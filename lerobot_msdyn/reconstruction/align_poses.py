@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float, Float32, Float64, UInt8
 from numpy import ndarray
 from torch import Tensor
 
@@ -20,7 +20,8 @@ from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.geometry import axis_angle_to_matrix, invert_se3, project, se3, transform_points
 from lerobot_msdyn.core.observations import Priors, View
 from lerobot_msdyn.core.sampling import scaled_px, scaled_window
-from lerobot_msdyn.reconstruction.key_views import KeyView
+from lerobot_msdyn.reconstruction.background import look_at_distance
+from lerobot_msdyn.reconstruction.key_views import KeyView, key_views
 
 logger = logging.getLogger(__name__)
 
@@ -67,7 +68,22 @@ class _Frame:
     intrinsics: Float[Tensor, "3 3"]
 
 
-@torch.no_grad()
+def keys_and_poses(view: View, priors: Priors, *, refine: bool) -> tuple[View, tuple[KeyView, ...]]:
+    """What stands still in a video, and the video with the poses of its camera, refined if that is wanted.
+
+    Args:
+        view: the video, at the size at which it is fitted.
+        priors: its depth and what moves.
+        refine: whether poses of a camera that moves are refined.
+    """
+    keys = key_views(view, priors)
+    if refine and not view.camera.is_static:
+        distance = look_at_distance(keys[0].empty.depth)
+        view = replace(view, camera=aligned_poses(keys, view, priors, distance))
+        keys = key_views(view, priors)
+    return view, keys
+
+
 def aligned_poses(keys: Sequence[KeyView], view: View, priors: Priors, distance: float) -> CameraTrack:
     """The camera with the poses at which what stands still looks most like each frame; those that gain nothing stay.
 
@@ -77,22 +93,34 @@ def aligned_poses(keys: Sequence[KeyView], view: View, priors: Priors, distance:
         priors: its depth and what moves.
         distance: m, to the look-at point.
     """
+    camera, moved = laid_over(keys, view, priors.depth, priors.instances, distance)
+    width = view.camera.width
+    logger.info("poses: refined by %.2f px (median) and %.2f px (at most), of %d", np.median(moved), max(moved), width)
+    return camera
+
+
+@torch.no_grad()
+def laid_over(
+    keys: Sequence[KeyView],
+    view: View,
+    depth: Float[Tensor, "t h w"],
+    instances: UInt8[Tensor, "t h w"],
+    distance: float,
+) -> tuple[CameraTrack, list[float]]:
+    """As `aligned_poses`, by depth (m) and what moves; and by how many pixels (median) each picture goes."""
     surface = _Surface.of(keys)
     poses, moved = view.camera.world_from_camera.clone(), []
     for t in range(len(view)):
-        mask = (priors.instances[t] > 0).numpy().astype(np.uint8)
+        mask = (instances[t] > 0).numpy().astype(np.uint8)
         still = cv2.dilate(mask, scaled_window(MASK_MARGIN_PX, mask.shape[1])) == 0
         frame = _Frame(
             _blurred(view.rgb[t].numpy().astype(np.float32).mean(-1)),
-            priors.depth[t].numpy() * still,
+            depth[t].numpy() * still,
             view.camera.intrinsics[t],
         )
         poses[t], by_px = _aligned(surface, frame, poses[t], distance)
         moved.append(by_px)
-    logger.info(
-        "poses: refined by %.2f px (median) and %.2f px (at most), of %d", np.median(moved), max(moved), mask.shape[1]
-    )
-    return replace(view.camera, world_from_camera=poses)
+    return replace(view.camera, world_from_camera=poses), moved
 
 
 def _blurred(picture: Float32[ndarray, "h w"]) -> list[Float32[ndarray, "h w"]]:

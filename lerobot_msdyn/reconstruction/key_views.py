@@ -56,6 +56,11 @@ class KeyView:
         return unproject_image(fill_depth(self.empty.depth), self.camera.intrinsics[0])
 
     @property
+    def source(self) -> Source:
+        """What it knows, as a frame that is fused."""
+        return Source.of(self.empty.rgb.numpy(), self.empty.depth.masked_fill(self.empty.seen == 0, 0.0), self.camera)
+
+    @property
     def points(self) -> Float[Tensor, "n 3"]:
         """The new surface points, m, in the world."""
         return transform_points(self.camera.world_from_camera[0], self.in_camera[self.new])
@@ -80,24 +85,9 @@ def key_views(view: View, priors: Priors) -> tuple[KeyView, ...]:
     tolerance = tolerance_of(difference)
     rest = [sources[i] for i in evenly(len(sources), CANDIDATES).tolist()]
     middle = _middle(view.camera, look_at_distance(priors.depth[0]))
-    chosen = min(rest, key=lambda source: _apart(source.camera, middle))
-    found: list[KeyView] = []
-    while True:
-        empty = _continued(fused(chosen, sources, tolerance, exact=difference < EXACT))
-        if found:
-            known = torch.cat([key.points for key in found])
-            new = (empty.seen > 0) & ~_shown(known, chosen.camera, empty.depth, tolerance)
-        else:
-            new = torch.ones_like(empty.seen, dtype=torch.bool)
-        found.append(KeyView(empty, chosen.camera, new))
-        rest = [source for source in rest if source is not chosen]
-        if not rest or len(found) == MOST_KEYS:
-            break
-        known = torch.cat([key.points for key in found])
-        lacking = [_lacking(known, source, tolerance) for source in rest]
-        if max(lacking) < LEAST_NEW:
-            break
-        chosen = rest[int(np.argmax(lacking))]
+    first = min(rest, key=lambda source: _apart(source.camera, middle))
+    fusing = Fusing(sources, tolerance, exact=difference < EXACT)
+    found = with_further([fusing.key_view(first, [])], [source for source in rest if source is not first], fusing)
     logger.info(
         "background: %d key views, %d surface elements; depths of frames differ by %.2f %%",
         len(found),
@@ -105,6 +95,39 @@ def key_views(view: View, priors: Priors) -> tuple[KeyView, ...]:
         100 * difference,
     )
     return tuple(found)
+
+
+@dataclass(frozen=True)
+class Fusing:
+    """How frames become key views."""
+
+    sources: Sequence[Source]  # that are fused
+    tolerance: float  # relative difference of depths up to which they are of one surface
+    exact: bool  # whether a frame's own depth is better than a median of several
+
+    def key_view(self, frame: Source, earlier: Sequence[KeyView]) -> KeyView:
+        """A frame as a key view, behind earlier ones."""
+        empty = _continued(fused(frame, self.sources, self.tolerance, exact=self.exact))
+        if not earlier:
+            return KeyView(empty, frame.camera, torch.ones_like(empty.seen, dtype=torch.bool))
+        known = torch.cat([key.points for key in earlier])
+        new = (empty.seen > 0) & ~shown(known, frame.camera, empty.depth, self.tolerance)
+        return KeyView(empty, frame.camera, new)
+
+
+def with_further(
+    found: Sequence[KeyView], candidates: Sequence[Source], fusing: Fusing, most: int = MOST_KEYS
+) -> list[KeyView]:
+    """Key views, and behind them those of the frames that show most that is lacking, until hardly anything is."""
+    found, rest = [*found], [*candidates]
+    while rest and len(found) < most:
+        known = torch.cat([key.points for key in found])
+        lacking = [_lacking(known, source, fusing.tolerance) for source in rest]
+        if max(lacking) < LEAST_NEW:
+            break
+        chosen = rest.pop(int(np.argmax(lacking)))
+        found.append(fusing.key_view(chosen, found))
+    return found
 
 
 def static_gaussians(keys: Sequence[KeyView], most: int) -> Gaussians:
@@ -138,7 +161,7 @@ def _continued(fused: Fused) -> EmptyScene:
     return EmptyScene(picture, fused.depth, fused.seen)
 
 
-def _shown(
+def shown(
     points: Float[Tensor, "n 3"], camera: CameraTrack, depth: Float[Tensor, "h w"], tolerance: float
 ) -> Bool[Tensor, "h w"]:
     """Pixels of a view with this depth (m) whose surface is among some points (m, world), or beside one."""
@@ -153,7 +176,7 @@ def _shown(
 
 def _lacking(known: Float[Tensor, "n 3"], source: Source, tolerance: float) -> float:
     """Share of a frame's pixels that show a surface which is not known."""
-    lacking = (source.depth > 0) & ~_shown(known, source.camera, source.depth, tolerance)
+    lacking = (source.depth > 0) & ~shown(known, source.camera, source.depth, tolerance)
     solid = cv2.morphologyEx(lacking.numpy().astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     return float(solid.mean())
 

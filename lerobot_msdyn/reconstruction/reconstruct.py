@@ -21,13 +21,13 @@ from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.dataset.provenance import merged
 from lerobot_msdyn.priors import estimate_priors
 from lerobot_msdyn.priors.camera.path import CameraPath
-from lerobot_msdyn.reconstruction.align_poses import aligned_poses
+from lerobot_msdyn.reconstruction.align_poses import keys_and_poses
 from lerobot_msdyn.reconstruction.antialias import enlarged
 from lerobot_msdyn.reconstruction.background import NEAR, look_at_distance
 from lerobot_msdyn.reconstruction.evidence import Evidence, evidence_of
 from lerobot_msdyn.reconstruction.fit import FitResult, fit
 from lerobot_msdyn.reconstruction.initialise import initialise
-from lerobot_msdyn.reconstruction.key_views import KeyView, fixed_view, key_views
+from lerobot_msdyn.reconstruction.key_views import KeyView, fixed_view
 from lerobot_msdyn.reconstruction.make_overlay import overlay_of
 from lerobot_msdyn.reconstruction.make_short_lived import key_frames, short_lived_of
 from lerobot_msdyn.reconstruction.pooled_background import (
@@ -42,6 +42,7 @@ from lerobot_msdyn.reconstruction.prune import without_contradicted
 from lerobot_msdyn.reconstruction.result import FittedWindow, Reconstruction
 from lerobot_msdyn.reconstruction.self_check import SelfCheck, self_check
 from lerobot_msdyn.reconstruction.share_background import moving_in_few, share_backgrounds
+from lerobot_msdyn.reconstruction.shown_elsewhere import Shown, with_shown
 from lerobot_msdyn.reconstruction.steady import steadied
 from lerobot_msdyn.reconstruction.upright import up_of
 from lerobot_msdyn.reconstruction.windows import Window, stands_of, whole_stands, windows
@@ -65,6 +66,7 @@ class Draft:
     backgrounds: Sequence[SharedBackground]
     progress: Callable[[float], object]
     device: torch.device
+    elsewhere: Sequence[Shown] = ()  # what other episodes show before a camera that moves
     path: CameraPath | None = None  # from the camera's usual place to where it is at each frame; None: it keeps still
     shared: SharedBackground | None = None  # the one that fits this window
     first: SharedBackground | None = None  # what the first window from the same place shows where nothing moves
@@ -120,11 +122,11 @@ def _priors(draft: Draft) -> None:
 
 def _background(draft: Draft) -> None:
     """What the camera sees where nothing moves, and how it stands to it."""
-    keys = key_views(draft.view, draft.priors)
-    if draft.recipe.camera.refine_poses and not draft.view.camera.is_static:
-        distance = look_at_distance(keys[0].empty.depth)
-        draft.view = replace(draft.view, camera=aligned_poses(keys, draft.view, draft.priors, distance))
-        keys = key_views(draft.view, draft.priors)
+    refine = draft.recipe.camera.refine_poses
+    draft.view, keys = keys_and_poses(draft.view, draft.priors, refine=refine)
+    elsewhere = [other for other in draft.elsewhere if other.fits(draft.view)]
+    if elsewhere:
+        keys = with_shown(keys, draft.view, elsewhere, refine=refine)
     if draft.shared is not None:
         keys = fixed_view(completed(keys[0].empty, draft.shared.empty, len(draft.view)), draft.view.camera)
     if draft.first is not None and draft.first.fits(draft.view):
@@ -242,7 +244,7 @@ def reconstruct(
     view: View,
     recipe: Recipe,
     progress: Callable[[float], object] = lambda share: None,
-    backgrounds: Sequence[SharedBackground] = (),
+    backgrounds: Sequence[SharedBackground | Shown] = (),
     *,
     others: Sequence[View] = (),
     episode: int | None = None,
@@ -259,7 +261,7 @@ def reconstruct(
         view: the video, at its own size.
         recipe: all settings.
         progress: called with the share of the work, 0..1, that was done since the last call.
-        backgrounds: what several episodes of this camera show together.
+        backgrounds: what several episodes of this camera show together, or each of some where it moves.
         others: videos of the same moments by other cameras, for stereo.
         episode: index of the episode, by which exchange files are found and checked.
         key: feature key of the camera, likewise.
@@ -274,6 +276,8 @@ def reconstruct(
     parts = [part for whole in whole_stands(view, stands) for part in windows(whole, recipe)]
     if len(parts) > 1 and not backgrounds and recipe.scene.shared_background:
         backgrounds = _shared_by_windows(parts, recipe, episode, key)
+    places = [background for background in backgrounds if isinstance(background, SharedBackground)]
+    elsewhere = [shown for shown in backgrounds if isinstance(shown, Shown) and shown.episode != episode]
     small_others = [other.shrunk(recipe.fit.max_width) for other in others]
     device = chosen_device(recipe.device)
     fitted: list[FittedWindow] = []
@@ -295,7 +299,9 @@ def reconstruct(
             return progress(share / len(parts))
 
         small = part.view.shrunk(recipe.fit.max_width)
-        draft = Draft(small, recipe, view.camera.width, estimate, backgrounds, within, device, part.path, first=first)
+        draft = Draft(
+            small, recipe, view.camera.width, estimate, places, within, device, elsewhere, part.path, first=first
+        )
         with torch_on_one_thread():
             for name, step in steps.items():
                 begin = time.perf_counter()

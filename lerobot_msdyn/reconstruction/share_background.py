@@ -1,6 +1,7 @@
 """What several videos of one camera show together is fitted once, and kept on disk."""
 
 import dataclasses
+import itertools
 import logging
 from dataclasses import replace
 from pathlib import Path
@@ -13,8 +14,10 @@ from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import EpisodeError
 from lerobot_msdyn.core.observations import DepthTraits, PointTracks, Priors, View
 from lerobot_msdyn.core.serialise import to_device
-from lerobot_msdyn.priors import estimate_masks
+from lerobot_msdyn.priors import estimate_masks, estimate_priors
 from lerobot_msdyn.priors.cache import code_digest, digest_of, open_cache
+from lerobot_msdyn.priors.estimate import known_camera
+from lerobot_msdyn.reconstruction.align_poses import keys_and_poses
 from lerobot_msdyn.reconstruction.background import NEAR, look_at_distance
 from lerobot_msdyn.reconstruction.fit import fit
 from lerobot_msdyn.reconstruction.initialise import initialise
@@ -28,6 +31,7 @@ from lerobot_msdyn.reconstruction.pooled_background import (
     pooled,
     same_places,
 )
+from lerobot_msdyn.reconstruction.shown_elsewhere import Shown
 from lerobot_msdyn.reconstruction.windows import Window, windows
 from lerobot_msdyn.render.devices import chosen_device
 
@@ -77,13 +81,34 @@ def moving_in_few(whole: Window, recipe: Recipe, elsewhere: Tensor, episode: int
     return torch.cat(masks)[few(len(whole.view))]
 
 
+def shown_by(view: View, recipe: Recipe, episode: int, key: str) -> Shown | None:
+    """What an episode shows to others of what stands still; None where its camera does so too, or poses are its own.
+
+    Raises:
+        PriorError: a prior was demanded and cannot be had.
+    """
+    small = view.shrunk(recipe.fit.max_width)
+    camera = known_camera(small, recipe.priors, recipe.camera, episode=episode, key=key)
+    if camera.is_static or not camera.world:
+        return None
+    keys = []
+    for part in windows(Window(0, small), recipe):
+        priors = estimate_priors(
+            part.view, recipe.priors, recipe.camera, episode=episode, key=key, device=recipe.device
+        )
+        posed = replace(part.view, camera=priors.camera or part.view.camera)
+        keys.append(keys_and_poses(posed, priors, refine=recipe.camera.refine_poses)[1])
+    by_rank = itertools.zip_longest(*keys)  # the first of each window first: they show most
+    return Shown.of(episode, [key_view for rank in by_rank for key_view in rank if key_view is not None])
+
+
 def _fitted(background: SharedBackground, recipe: Recipe) -> SharedBackground:
     """A shared background with a static set that was fitted to its picture; without depth there is none."""
     empty, camera = background.empty, background.camera
     if not bool((empty.depth > 0).any()):
         return background
     nothing = torch.zeros(1, *empty.seen.shape, dtype=torch.uint8)
-    priors = Priors(empty.depth[None], nothing, _no_tracks(), DepthTraits(metric=True))
+    priors = Priors(empty.depth[None], nothing, PointTracks.none(1), DepthTraits(metric=True))
     view = View(empty.rgb[None], camera)
     scene = initialise(
         view, priors, replace(recipe.scene, moving_gaussians=0), recipe.motion, fixed_view(empty, camera)
@@ -99,8 +124,3 @@ def _fitted(background: SharedBackground, recipe: Recipe) -> SharedBackground:
         logger.warning("shared background: %s; every episode fits its own", error)
         return background
     return replace(background, static=to_device(result.scene.static, "cpu"))
-
-
-def _no_tracks() -> PointTracks:
-    none = torch.zeros(0, 1)
-    return PointTracks(torch.zeros(0, 1, 2), none.bool(), none, torch.zeros(0, dtype=torch.long))

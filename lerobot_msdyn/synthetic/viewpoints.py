@@ -68,6 +68,19 @@ def hand_held_camera(frames: int, width: int, height: int, sway_deg: float = 4.0
     return CameraTrack(intrinsics, torch.from_numpy(np.stack(poses)).float(), width, height)
 
 
+def walking_camera(
+    frames: int, width: int, height: int, azimuth_deg: tuple[float, float], world: str = ""
+) -> CameraTrack:
+    """A camera that goes along an arc from one azimuth to another, up and down by 3 degrees on its way."""
+    way = np.linspace(0, 1, frames)
+    poses = [
+        _orbit(azimuth_deg[0] + (azimuth_deg[1] - azimuth_deg[0]) * t, ELEVATION + 3 * math.sin(2 * math.pi * t))
+        for t in way.tolist()
+    ]
+    intrinsics = intrinsics_from_fov(width, height, FOV).expand(frames, 3, 3).contiguous()
+    return CameraTrack(intrinsics, torch.from_numpy(np.stack(poses)).float(), width, height, world=world)
+
+
 def heldout_cameras(frames: int, width: int, height: int) -> dict[str, CameraTrack]:
     """The front camera moved by 5 and 10 degrees of azimuth, 8 of elevation, 5 cm sideways and 12 % closer."""
     return {name: _fixed(pose, frames, width, height) for name, pose in HELDOUT.items()}

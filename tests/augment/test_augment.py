@@ -299,7 +299,7 @@ def test_an_interrupted_run_keeps_what_it_says(
     def stopped(*_: Any) -> None:
         raise KeyboardInterrupt
 
-    where, what = (workers, "shared_backgrounds") if moment == "background" else (job, "augment_episode")
+    where, what = (workers, "seen_together") if moment == "background" else (job, "augment_episode")
     monkeypatch.setattr(where, what, stopped)
     arguments = ["--repo", "local/desk", "--root", str(desk), "--new_root", str(tmp_path / "new")]
     arguments += ["--cameras", "[front]", "--variants", "1", "--workers", "1", *FAST]

@@ -27,11 +27,14 @@ def test_calibration_by_key_or_its_last_part(tmp_path: Path, name: str) -> None:
     # World to camera maps x to R x + t, so the camera's centre is -R^T t.
     torch.testing.assert_close(camera.world_from_camera[0, :3, 3], torch.tensor([-2.0, 1.0, -3.0]))
     torch.testing.assert_close(camera.camera_from_world[1, :3, :3], torch.tensor(TURNED["R"]).float())
+    assert camera.world == "calibration"
 
 
 def test_calibration_per_episode(tmp_path: Path) -> None:
     path = write(tmp_path, {"episodes": {"3": {"cameras": {"front": {"K": K}}}}})
-    assert read_calibration(path, "front", 3, 2, 640, 480) is not None
+    camera = read_calibration(path, "front", 3, 2, 640, 480)
+    assert camera is not None
+    assert camera.world == ""  # without a pose it is the camera's own frame
     assert read_calibration(path, "front", 0, 2, 640, 480) is None
 
 

@@ -31,6 +31,7 @@ def content() -> dict[str, np.ndarray]:
         "query_t": np.zeros(N, np.int64),
         "K": np.tile(np.array([[30, 0, 16], [0, 30, 12], [0, 0, 1]], np.float32), (T, 1, 1)),
         "w2c": np.tile(np.eye(4, dtype=np.float32), (T, 1, 1)),
+        "world": np.array("cell"),
         "provenance": np.array(json.dumps({"depth": {"model": "some/model", "licence": "MIT"}})),
     }
 
@@ -50,13 +51,22 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
         "depth_kind",
         "episode",
         "camera",
+        "world",
     }
     written = Exchange(
-        T, H, W, 3, FRONT, depth_kind="scale", provenance={"a": 1}, **{name: arrays[name] for name in names}
+        T,
+        H,
+        W,
+        3,
+        FRONT,
+        depth_kind="scale",
+        world="cell",
+        provenance={"a": 1},
+        **{name: arrays[name] for name in names},
     )
     write_exchange(tmp_path / "new" / "x.npz", written)
     read = read_exchange(tmp_path / "new" / "x.npz", T, H, W, 3, FRONT)
-    assert (read.depth_kind, read.provenance) == ("scale", {"a": 1})
+    assert (read.depth_kind, read.world, read.provenance) == ("scale", "cell", {"a": 1})
     for name in names:
         np.testing.assert_array_equal(getattr(read, name), getattr(written, name))
 

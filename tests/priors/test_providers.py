@@ -139,6 +139,7 @@ def test_everything_from_an_exchange_file(view: View, tmp_path: Path) -> None:
         vis=np.ones((3, FRAMES), bool),
         K=np.array([[80.0, 0, 48], [0, 80, 36], [0, 0, 1]]),
         w2c=np.tile(np.eye(4), (FRAMES, 1, 1)),
+        world="cell",
         provenance='{"depth": {"model": "some/model", "licence": "MIT"}}',
     ).replace("front_0", "{camera}_{episode}")
     priors = estimate(view, CameraConfig(poses=file), depth=file, masks=file, tracks=file)
@@ -146,6 +147,7 @@ def test_everything_from_an_exchange_file(view: View, tmp_path: Path) -> None:
     assert len(priors.tracks) == 1
     assert priors.camera is not None
     assert (float(priors.camera.intrinsics[0, 0, 0]), priors.camera.origin) == (80.0, "exchange")
+    assert priors.camera.world == "cell"
     assert priors.provenance["depth"]["model"] == "some/model"
     assert "scaled and shifted to recorded" in priors.provenance["depth"]["why"]
     known = priors.depth > 0

@@ -1,6 +1,7 @@
 """Poses of a moving camera."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.errors import PriorError
 from lerobot_msdyn.core.geometry import axis_angle_to_matrix, se3
 from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.priors.camera import sfm
 from lerobot_msdyn.priors.camera.sfm import camera_from_sfm, interpolated_poses
 from lerobot_msdyn.synthetic import make_scene
 
@@ -27,6 +29,18 @@ def moving() -> tuple[View, torch.Tensor]:
     camera = CameraTrack(scene.camera.intrinsics, poses.float(), 320, 240)
     seen = scene.render(camera)
     return View(seen.rgb, camera), seen.instances
+
+
+def test_poses_are_in_a_frame_of_their_own(moving, monkeypatch: pytest.MonkeyPatch) -> None:
+    view, instances = moving
+    view = replace(view, camera=replace(view.camera, world="calibration"))
+    poses = {frame: pose.double().numpy() for frame, pose in enumerate(view.camera.world_from_camera)}
+    model = poses, view.camera.intrinsics[0].double().numpy()
+    monkeypatch.setattr(sfm, "demand_library", lambda *_: None)
+    monkeypatch.setattr(sfm, "_reconstruct", lambda *_: model)
+    found = camera_from_sfm(view, instances)
+    assert not found.is_static
+    assert found.world == ""
 
 
 @pytest.mark.slow

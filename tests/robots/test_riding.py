@@ -32,6 +32,7 @@ def test_poses_of_a_camera_on_a_link(
         path = out / f"episode_{episode:06d}" / f"{WRIST}.npz"
         content = read_exchange(path, FRAMES, HEIGHT, WIDTH, episode, WRIST)
         assert content.w2c is not None
+        assert content.world == "robot"
         away = np.linalg.norm(np.linalg.inv(content.w2c)[2:-2, :3, 3] - (links @ eye)[2:-2, :3, 3], axis=1)
         assert np.median(away) < 0.02  # m
 

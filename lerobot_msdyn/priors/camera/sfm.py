@@ -60,6 +60,7 @@ def camera_from_sfm(view: View, instances: UInt8[Tensor, "t h w"]) -> CameraTrac
         intrinsics=torch.from_numpy(intrinsics).float().expand(len(view.rgb), 3, 3).contiguous(),
         world_from_camera=world_from_camera,
         origin=SFM,
+        world="",
     )
 
 
