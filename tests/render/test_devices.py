@@ -88,6 +88,7 @@ def test_a_fit_stays_on_the_gpu(gpu: FakeGpu) -> None:
     assert every_step == {"reconstruction/fit.py _check"}  # that the loss is finite
     assert set(waits) - every_step == {
         "motion/model/bases.py _moves",
+        "motion/model/bases.py _at_frames",
         "reconstruction/fit.py psnr",
         "reconstruction/fit.py _result",
     }
@@ -128,7 +129,7 @@ def test_what_is_made_of_a_fit(gpu: FakeGpu) -> None:
     waits.pop("scene/overlay.py _first")
     waits.pop("scene/short_lived.py _first")
     patches = {"scene/dynamic.py patched": FRAMES, "scene/dynamic.py patch": FRAMES}
-    assert waits == patches | {"motion/model/bases.py _moves": 1}
+    assert waits == patches | {"motion/model/bases.py _moves": 1, "motion/model/bases.py _at_frames": 2}
     batches = -(-FRAMES // BATCH)
     assert copies == {"core/serialise.py to_device": 3 * FRAMES + 2 * batches}  # coverage; pictures and depth
 

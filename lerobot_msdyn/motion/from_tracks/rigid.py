@@ -7,10 +7,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lerobot_msdyn.core.geometry import invert_se3, transform_points, weighted_procrustes
-from lerobot_msdyn.motion.from_tracks.sweep import swept
+from lerobot_msdyn.motion.from_tracks.sweep import NORMAL_MAD, swept
 
 MIN_EFFECTIVE = 5.0  # tracks that a frame needs for its motion to be accepted: (sum w)² / sum w²
-_NORMAL_MAD = 1.4826  # standard deviations in the median absolute deviation of a normal distribution
 _NOISE_FLOOR = 1e-4  # of the group's extent: the smallest scale of the robust weights
 
 
@@ -103,7 +102,7 @@ def _robust_weights(
 ) -> Float[Tensor, "*batch n"]:
     """Geman-McClure weights; their scale is the median distance of the points that take part."""
     taking_part = torch.where(weights > 0, distance, torch.nan)
-    scale = torch.maximum(_NORMAL_MAD * taking_part.nanmedian(dim=-1).values.nan_to_num(0.0), floor)
+    scale = torch.maximum(NORMAL_MAD * taking_part.nanmedian(dim=-1).values.nan_to_num(0.0), floor)
     return weights / (1 + (distance / scale[..., None]).square()).square()
 
 

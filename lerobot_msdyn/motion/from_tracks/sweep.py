@@ -17,7 +17,7 @@ from lerobot_msdyn.render.cpu.simd import take_ticket
 from lerobot_msdyn.render.cpu.threads import run
 
 _IRLS_STEPS = 5
-_NORMAL_MAD = 1.4826  # standard deviations in the median absolute deviation of a normal distribution
+NORMAL_MAD = 1.4826  # standard deviations in the median absolute deviation of a normal distribution
 _MODEL_MEMORY = 10  # observations that a model point averages while the clip is swept
 
 
@@ -114,7 +114,7 @@ def _swept(
     distance, some, robust, usable = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     a, v, sums = np.empty((4, 4)), np.empty((4, 4)), np.empty((3, 3))
     model, target, count = np.empty((n, 3)), np.empty((n, 3)), np.empty(n)
-    last, motion, step_of_carrier = np.empty((4, 4)), np.eye(4), np.empty((4, 4))
+    last, motion, spare = np.empty((4, 4)), np.eye(4), np.empty((4, 4))
     group = take_ticket(tickets)
     while group < groups:
         start = reference[group]
@@ -135,10 +135,10 @@ def _swept(
                     for axis in range(3):
                         target[i, axis] = xyz[i, frame, axis]
                 if len(carry) > 0:
-                    _inverse(carry[group, frame - direction], step_of_carrier)
-                    _multiply(carry[group, frame], step_of_carrier, motion)
-                    _multiply(motion, last, step_of_carrier)
-                    last[:] = step_of_carrier
+                    _inverse(carry[group, frame - direction], spare)
+                    _multiply(carry[group, frame], spare, motion)
+                    _multiply(motion, last, spare)
+                    last[:] = spare
                 motion[:] = last
                 for _ in range(_IRLS_STEPS):
                     taking_part = 0
@@ -147,7 +147,7 @@ def _swept(
                         if usable[i] > 0:
                             some[taking_part] = distance[i]
                             taking_part += 1
-                    scale = max(_NORMAL_MAD * _median_of(some, taking_part), floor[group])
+                    scale = max(NORMAL_MAD * _median_of(some, taking_part), floor[group])
                     for i in range(n):
                         ratio = distance[i] / scale
                         robust[i] = usable[i] / ((1 + ratio * ratio) * (1 + ratio * ratio))

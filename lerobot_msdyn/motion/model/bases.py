@@ -49,18 +49,18 @@ class MotionLevel:
         return bool(self.active.any())
 
     @cached_property
-    def _at_frames(self) -> Float[Tensor, "k t 3 4"]:
-        """The maps of every basis at the frames from the first knot to the last."""
-        first, last = self.knots[0].item(), self.knots[-1].item()
-        return level_affines(self, torch.arange(int(first), int(last) + 1, device=self.knots.device))
+    def _at_frames(self) -> tuple[int, Float[Tensor, "k t 3 4"]]:
+        """The first knot, and the maps of every basis at the frames from there to the last knot."""
+        first, last = int(self.knots[0]), int(self.knots[-1])
+        return first, level_affines(self, torch.arange(first, last + 1, device=self.knots.device))
 
     def affines(self, times: Float[Tensor, " b"] | Int[Tensor, " b"]) -> Float[Tensor, "k b 3 4"]:
         """The maps of every basis at some times, in frames: `level_affines`, computed once unless they are learned."""
         learned = self.rotations_6d.requires_grad or self.displacements.requires_grad
         if learned or times.is_floating_point():
             return level_affines(self, times)
-        maps = self._at_frames
-        return maps[:, (times - int(self.knots[0])).clamp(0, maps.shape[1] - 1)]
+        first, maps = self._at_frames
+        return maps[:, (times - first).clamp(0, maps.shape[1] - 1)]
 
     def carry(
         self,
