@@ -128,7 +128,7 @@ def test_what_is_made_of_a_fit(gpu: FakeGpu) -> None:
     assert np.isfinite(scores.expected_db)
     waits.pop("scene/overlay.py _first")
     waits.pop("scene/short_lived.py _first")
-    patches = {"scene/dynamic.py patched": FRAMES, "scene/dynamic.py patch": FRAMES}
+    patches = {"scene/dynamic.py patch": FRAMES}
     assert waits == patches | {"motion/model/bases.py _moves": 1, "motion/model/bases.py _at_frames": 2}
     batches = -(-FRAMES // BATCH)
     assert copies == {"core/serialise.py to_device": 3 * FRAMES + 2 * batches}  # coverage; pictures and depth
