@@ -63,10 +63,13 @@ def seen_together(
     run: Run | None = None,
     say: Callable[[str, float], object] = lambda what, share: None,
 ) -> Backgrounds:
-    """`shown_backgrounds` of cameras that move, with poses that can be compared; `shared_backgrounds` of the others."""
+    """What each episode shows where a camera moves and poses can be compared; `shared_backgrounds` of the others.
+
+    Arguments as for `shared_backgrounds`.
+    """
     if not recipe.camera.known_before:
         return shared_backgrounds(source, cameras, recipe, run, say)
-    shown = shown_backgrounds(source, cameras, recipe, run, say)
+    shown = _shown_backgrounds(source, cameras, recipe, run, say)
     others = [key for key in cameras if not shown[key]]
     shared = shared_backgrounds(source, others, recipe, run, lambda what, _: say(what, 0.0)) if others else {}
     return {**shared, **{key: found for key, found in shown.items() if found}}
@@ -120,17 +123,14 @@ def shared_backgrounds(
     return backgrounds
 
 
-def shown_backgrounds(
+def _shown_backgrounds(
     source: LeRobotDatasetMetadata,
     cameras: list[str],
     recipe: Recipe,
-    run: Run | None = None,
-    say: Callable[[str, float], object] = lambda what, share: None,
+    run: Run | None,
+    say: Callable[[str, float], object],
 ) -> dict[str, list[Shown]]:
-    """Per camera that moves, with poses in a world that episodes share, what each of some of them shows.
-
-    Arguments as for `shared_backgrounds`.
-    """
+    """Per camera that moves, with poses in a world that episodes share, what each of some of them shows."""
     tasks = [ShownTask(index, key, recipe) for key in cameras for index in background_episodes(source, recipe)]
     look = functools.partial(shown_in_episode, source)
     found: dict[str, list[Shown]] = {key: [] for key in cameras}
