@@ -2,7 +2,7 @@
 
 import functools
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,7 +22,7 @@ from lerobot_msdyn.views.filling import filled, missing
 
 logger = logging.getLogger(__name__)
 
-BATCH = 4  # frames that are rendered at a time, by each thread
+BATCH = 4  # frames that a GPU renders at a time; each thread of the CPU renders one, which stays in its cache
 Rendered = tuple[Rendering, list[Coverage], Float[Tensor, "#t #h #w 3"]]  # frames, their coverage, what fills holes
 
 
@@ -54,12 +54,20 @@ def new_pictures(
         frames: those that its poses belong to (int, [t]); default: all.
         fill: how holes are filled.
     """
-    for rendering, of_frames, behind in _rendered(scene, camera, frames, fill):
-        composed = (rendering.rgb + missing(rendering.alpha)[..., None] * behind).clamp(0, 1)
-        rgb, depths = to_device(((composed * 255).round().to(torch.uint8), rendering.depth), "cpu")
-        for i, coverage in enumerate(of_frames):
-            depth = np.where(~coverage.empty & scene.metric, depths[i].numpy(), np.float32(0))
-            yield Picture(rgb[i].numpy(), depth, coverage.unseen)
+    for pictures in _rendered(scene, camera, frames, fill, functools.partial(_composed, metric=scene.metric)):
+        yield from pictures
+
+
+@torch.no_grad()
+def _composed(rendered: Rendered, *, metric: bool) -> list[Picture]:
+    """Pictures with what is behind in their holes."""
+    rendering, of_frames, behind = rendered
+    composed = (rendering.rgb + missing(rendering.alpha)[..., None] * behind).clamp(0, 1)
+    rgb, depths = to_device(((composed * 255).round().to(torch.uint8), rendering.depth), "cpu")
+    return [
+        Picture(picture.numpy(), np.where(~coverage.empty & metric, depth.numpy(), np.float32(0)), coverage.unseen)
+        for picture, depth, coverage in zip(rgb, depths, of_frames, strict=True)
+    ]
 
 
 def log_uncovered(pictures: Iterator[Picture]) -> Iterator[Picture]:
@@ -73,7 +81,7 @@ def log_uncovered(pictures: Iterator[Picture]) -> Iterator[Picture]:
 
 def coverages(scene: Reconstruction, camera: CameraTrack, frames: Tensor | None = None) -> Iterator[Coverage]:
     """What is known about each pixel of another camera's frames; arguments as in `new_pictures`."""
-    for _, of_frames, _ in _rendered(scene, camera, frames):
+    for _, of_frames, _ in _rendered(scene, camera, frames, "none", lambda rendered: rendered):
         yield from of_frames
 
 
@@ -106,29 +114,31 @@ class UnseenMasks:
         return masks | {f"{key}.width": np.array(width) for key, width in self._width.items()}
 
 
-def _rendered(
-    scene: Reconstruction, camera: CameraTrack, frames: Tensor | None, fill: Fill = "none"
-) -> Iterator[Rendered]:
-    """Some frames at a time through another camera, what is known about them, and what fills their holes."""
+def _rendered[T](
+    scene: Reconstruction, camera: CameraTrack, frames: Tensor | None, fill: Fill, made: Callable[[Rendered], T]
+) -> Iterator[T]:
+    """What is made of some frames at a time through another camera, and of what is known about them."""
     frames = torch.arange(len(scene.camera)) if frames is None else frames
     for window, part in scene.stretches(frames):
         times, poses = frames[part] - window.start, camera.select(part)
         still = _still(window, poses, times, fill) if poses.is_static else None
-        some = functools.partial(_some_rendered, window, poses, times, fill, still)
-        starts = range(0, len(times), BATCH)
-        yield from in_threads(some, starts) if window.scene.device.type == "cpu" else map(some, starts)
+        some = functools.partial(_some_made, made, window, poses, times, fill, still)
+        on_cpu = window.scene.device.type == "cpu"
+        size = 1 if on_cpu else BATCH
+        batches = [slice(start, min(start + size, len(times))) for start in range(0, len(times), size)]
+        yield from in_threads(some, batches) if on_cpu else map(some, batches)
 
 
-def _some_rendered(
+def _some_made[T](
+    made: Callable[[Rendered], T],
     window: FittedWindow,
     camera: CameraTrack,
     times: Int[Tensor, " every"],
     fill: Fill,
     still: _Still | None,
-    start: int,
-) -> Rendered:
-    """A batch of a window's frames."""
-    batch = slice(start, min(start + BATCH, len(times)))
+    batch: slice,
+) -> T:
+    """What is made of a batch of a window's frames."""
     poses = camera.select(batch)
     rendering = next(render_frames(window.scene, poses, times[batch], extra=window.evidence.moving_frames))
     if fill == "none":
@@ -138,7 +148,7 @@ def _some_rendered(
     else:
         behind = still.filling * _brightness(window.scene, times[batch], times)
     looked_up = None if still is None else still.looked
-    return rendering, coverage_of(rendering, poses, window.evidence, looked_up), behind
+    return made((rendering, coverage_of(rendering, poses, window.evidence, looked_up), behind))
 
 
 @torch.no_grad()
