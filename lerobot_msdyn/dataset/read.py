@@ -1,11 +1,10 @@
 """Read LeRobot episodes into plain tensors: pixels, cameras, recorded depth, state and action."""
 
 import io
-import itertools
 import logging
 import shutil
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,7 @@ from lerobot_msdyn.core.files import cache_folder, check_root
 from lerobot_msdyn.core.observations import RobotSeen, View
 from lerobot_msdyn.dataset.calibration import make_camera, read_robot
 from lerobot_msdyn.dataset.checks import IntactEpisodes, check_metadata, picture_size, read_json
-from lerobot_msdyn.dataset.chroma import is_subsampled, restore_chroma
+from lerobot_msdyn.dataset.chroma import is_subsampled, with_chroma
 from lerobot_msdyn.dataset.features import completed
 from lerobot_msdyn.dataset.named import check_named, no_dataset
 from lerobot_msdyn.dataset.rows import TIMESTAMP_TOLERANCE_S, on_grid, read_rows, source_file, task_of
@@ -47,7 +46,6 @@ from lerobot_msdyn.robots.seen import robot_seen
 logger = logging.getLogger(__name__)
 
 CODEBASE_VERSION = "v3.0"
-BLOCK_FRAMES = 128  # that are decoded at once
 MILLIMETRES = 1000.0
 
 
@@ -305,23 +303,25 @@ def _decode_video(
     chosen: Sequence[int] | None,
     in_metres: Callable[[Tensor], Tensor] | None = None,
 ) -> Tensor:
-    """Frames of a video: colours [t,h,w,3], or what is made of the depth codes of some at a time [b,1,h,w].
+    """Frames of a video: colours [t,h,w,3], or what is made of the depth codes of one [1,1,h,w].
 
-    Worked on in blocks, so that a video is in memory once.
+    Worked on as they are decoded, so that a video is in memory once.
     """
     video, numbers = find_frames(meta, index, key, rows)
     if chosen is not None:
         numbers = [numbers[frame] for frame in chosen]
-    pictures = decoded(video, numbers, is_depth=in_metres is not None)
-    restored = restore_chroma if is_subsampled(video.pix_fmt) else Tensor.contiguous
+    pictures: Iterator[np.ndarray] = decoded(video, numbers, is_depth=in_metres is not None)
+    if in_metres is None and is_subsampled(video.pix_fmt):
+        pictures = with_chroma(pictures)
     frames: Tensor | None = None
     try:
-        for first in range(0, len(numbers), BLOCK_FRAMES):
-            block = torch.from_numpy(np.stack(list(itertools.islice(pictures, BLOCK_FRAMES))))
-            block = restored(block) if in_metres is None else in_metres(block[:, None])
+        for place, picture in enumerate(pictures):
+            frame = torch.from_numpy(picture)
+            if in_metres is not None:
+                frame = in_metres(frame[None, None])[0]
             if frames is None:
-                frames = block.new_empty(len(numbers), *block.shape[1:])
-            frames[first : first + len(block)] = block
+                frames = frame.new_empty(len(numbers), *frame.shape)
+            frames[place] = frame
     except (*VIDEO_ERRORS, TypeError) as error:  # TypeError: settings of the depth's codes
         raise EpisodeError(
             f"{meta.repo_id} episode {index}, {key}: {video.path} cannot be decoded for all of its {len(numbers)} "

@@ -5,6 +5,7 @@ file's own frames are listed first, without decoding them, and given to its epis
 frames as it has rows, none of them another's, or an error that says why not.
 """
 
+import bisect
 import logging
 import math
 from collections import deque
@@ -30,6 +31,7 @@ SURE = 0.25  # of a frame: a start that is nearer to a frame than this is that f
 COVERED = 0.75  # of a frame: less than this may follow the last frame that rows name
 UPRIGHT = (1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30)  # a display matrix that changes nothing
 FILES_KEPT = 8  # up to 20 MB each
+SPARED = 8  # frames that need not be decoded, for which a file is opened again
 
 
 @dataclass(frozen=True)
@@ -243,6 +245,25 @@ def decoded(video: VideoIndex, numbers: Sequence[int], *, is_depth: bool = False
         ValueError: a frame cannot be decoded.
         Exception: one of VIDEO_ERRORS.
     """
+    for stretch in _stretches(video, numbers):
+        yield from _decoded(video, stretch, is_depth=is_depth)
+
+
+def _stretches(video: VideoIndex, numbers: Sequence[int]) -> list[list[int]]:
+    """The numbers, cut where a key frame spares the decoding of many frames between two of them."""
+    place = {pts: number for number, pts in enumerate(video.shown)}
+    keys = sorted(place[packet.pts] for packet in video.packets if packet.is_key)
+    stretches: list[list[int]] = [[]]
+    for number in numbers:
+        key = keys[bisect.bisect(keys, number) - 1] if keys and keys[0] <= number else 0
+        if stretches[-1] and key - stretches[-1][-1] > SPARED:
+            stretches.append([])
+        stretches[-1].append(number)
+    return stretches
+
+
+def _decoded(video: VideoIndex, numbers: Sequence[int], *, is_depth: bool) -> Iterator[np.ndarray]:
+    """The same of frames between which all are decoded."""
     shown = video.shown
     wanted = deque(shown[number] for number in numbers)
     starts = [packet.dts for packet in video.packets if packet.is_key and packet.pts <= wanted[0]]

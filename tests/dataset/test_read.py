@@ -10,7 +10,7 @@ from lerobot.datasets import LeRobotDataset
 
 from lerobot_msdyn.core.config import CameraConfig
 from lerobot_msdyn.core.errors import DatasetError, EpisodeError
-from lerobot_msdyn.dataset.chroma import restore_chroma
+from lerobot_msdyn.dataset.chroma import with_chroma
 from lerobot_msdyn.dataset.read import open_source, read_episode
 
 FRONT, SIDE = "observation.images.front", "observation.images.side"
@@ -26,7 +26,7 @@ def test_an_episode_is_what_lerobot_returns(desk: Path) -> None:
         for key in (FRONT, SIDE):
             view = episode.views[key]
             decoded = (item[key].permute(1, 2, 0) * 255).round().to(torch.uint8)
-            assert torch.equal(view.rgb[i], restore_chroma(decoded[None])[0])
+            assert torch.equal(view.rgb[i], torch.from_numpy(next(with_chroma([decoded.numpy()]))))
             assert view.depth is not None
             assert torch.equal(view.depth[i], item[f"{key}_depth"][0])
         assert episode.state is not None

@@ -263,6 +263,8 @@ def test_episodes_that_start_between_key_frames(tmp_path: Path, options: dict[st
     assert [packet.pts for packet in video.packets] != video.shown, "no B-frames"
     for number in range(len(codes)):
         assert code_of(next(decoded(video, [number]))) == codes[number]
+    every_tenth = range(0, len(codes), 10)
+    assert [code_of(picture) for picture in decoded(video, every_tenth)] == codes[::10]
     written(tmp_path / "bars", tmp_path / "new")
 
 
