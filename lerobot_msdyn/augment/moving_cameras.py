@@ -15,9 +15,10 @@ from lerobot_msdyn.augment.recorded import read_recorded
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import DatasetError, EpisodeError
 from lerobot_msdyn.core.sampling import evenly, scaled_px
-from lerobot_msdyn.dataset.read import Episode
+from lerobot_msdyn.dataset.read import Episode, hand_on
 from lerobot_msdyn.dataset.select import is_wrist_camera
 from lerobot_msdyn.priors.camera.steadiness import SWAY_PX, camera_motion_px
+from lerobot_msdyn.priors.defects import Defects
 from lerobot_msdyn.reconstruction.windows import seen_stands
 
 logger = logging.getLogger(__name__)
@@ -39,7 +40,7 @@ def still_cameras(
         DatasetError: one that the recipe names moves, or no camera is left and recorded episodes are not asked for.
         EpisodeError: none of the episodes can be read.
     """
-    episode = _first_readable(source, episodes, cameras, recipe)
+    episode, defects = _first_readable(source, episodes, cameras, recipe)
     moving = {key: reason for key in cameras if (reason := why_moving(episode, key, recipe.priors.cache))}
     refused = recipe.cameras is not None or (len(moving) == len(cameras) and not recipe.include_source)
     for key, reason in moving.items():
@@ -48,7 +49,11 @@ def still_cameras(
         if refused:
             raise DatasetError(message)
         logger.warning(message)
-    return [key for key in cameras if key not in moving]
+    still = [key for key in cameras if key not in moving]
+    for key in still:
+        if not defects[key].unusable:  # else these are not its frames as recorded
+            hand_on(source, episode.source.index, key, episode.views[key].rgb)
+    return still
 
 
 def cameras_off_the_gripper(source: LeRobotDatasetMetadata, cameras: list[str], recipe: Recipe) -> list[str]:
@@ -76,12 +81,12 @@ def cameras_off_the_gripper(source: LeRobotDatasetMetadata, cameras: list[str], 
 
 def _first_readable(
     source: LeRobotDatasetMetadata, episodes: Sequence[int], cameras: list[str], recipe: Recipe
-) -> Episode:
-    """The first of some episodes that can be read; the others are reported when it is their turn."""
+) -> tuple[Episode, dict[str, Defects]]:
+    """The first of some episodes that can be read, and its defects; the others are reported when it is their turn."""
     errors = []
     for index in episodes:
         try:
-            return read_recorded(source, index, cameras, recipe, recorded_depth=False)[0]
+            return read_recorded(source, index, cameras, recipe, recorded_depth=False)
         except EpisodeError as error:
             errors.append(error)
     raise EpisodeError(

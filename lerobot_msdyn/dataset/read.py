@@ -78,6 +78,7 @@ class Source(LeRobotDatasetMetadata):
     """The metadata of a dataset that is read."""
 
     tolerance_s: float = TIMESTAMP_TOLERANCE_S  # how far a frame may be from its row's time, as LeRobotDataset has it
+    handed_on: dict[tuple[int, str], UInt8[Tensor, "t h w 3"]]  # whole videos, each for who reads it next
 
 
 def open_source(
@@ -112,7 +113,7 @@ def open_source(
         source.info.total_episodes, source.info.total_frames = intact.count, intact.frames
     for key, feature in source.features.items():
         source.features[key] = completed(feature)
-    source.tolerance_s = tolerance_s
+    source.tolerance_s, source.handed_on = tolerance_s, {}
     return source
 
 
@@ -227,10 +228,18 @@ def read_colour(
     Raises:
         EpisodeError: a frame is absent or cannot be decoded.
     """
+    if frames is None and isinstance(meta, Source) and (index, key) in meta.handed_on:
+        return meta.handed_on.pop((index, key))
     if key in meta.video_keys:
         return _decode_video(meta, index, key, rows, frames)
     images = [_decode_image(meta, index, key, item, cv2.IMREAD_COLOR_RGB) for item in _images(rows, key, frames)]
     return torch.from_numpy(np.stack(images))
+
+
+def hand_on(meta: LeRobotDatasetMetadata, index: int, key: str, rgb: UInt8[Tensor, "t h w 3"]) -> None:
+    """Spare the next one who reads all frames of a colour camera from decoding them again."""
+    if isinstance(meta, Source):
+        meta.handed_on[index, key] = rgb
 
 
 def read_depth(

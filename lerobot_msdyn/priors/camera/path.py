@@ -1,5 +1,6 @@
 """Where the picture of a camera goes during a clip: every frame against the first, whatever moves before the camera."""
 
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +11,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.core.sampling import REFERENCE_WIDTH, scaled_px
+from lerobot_msdyn.render.cpu.threads import in_threads
 
 Affine = Float64[ndarray, "2 3"]
 
@@ -74,18 +76,20 @@ def camera_path(rgb: UInt8[Tensor, "t h w 3"]) -> CameraPath:
     the camera does not matter while it covers less than about half of the picture. Frames that cannot be laid over
     others are taken to be where the one before was. Pictures wider than 320 px are looked at in that width.
     """
-    first, *others = (evened(frame) for frame in rgb.numpy())
-    height, width = first.shape
-    reference, affine, before = _Corners(first), _still(), _Corners(first)
+    corners = in_threads(lambda frame: _Corners(evened(frame)), rgb.numpy())
+    reference = next(corners)
+    pairs = itertools.pairwise(itertools.chain([reference], corners))
+    affine, before = _still(), reference
     affines = [affine]
-    for frame in others:
-        here = _Corners(frame)
-        step = before.motion_to(here)
+    for last, here, step in in_threads(lambda pair: (*pair, pair[0].motion_to(pair[1])), pairs):
+        if before is not last:  # onto which nothing could be laid
+            step = before.motion_to(here)
         if step is not None:
             affine, before = _after(affine, step), here
         found = reference.motion_near(here, affine)
         affine = affine if found is None else found
         affines.append(affine)
+    height, width = reference.picture.shape
     return CameraPath(np.stack(affines), width, height)
 
 
