@@ -292,10 +292,13 @@ def _guess(
 
 
 def _masked_mean(flow: Float32[ndarray, "h w 2"], mask: Bool[ndarray, "h w"]) -> Float32[ndarray, "h w 2"]:
-    """Mean flow of the masked pixels in a window about every pixel."""
+    """Mean flow of the masked pixels in a window about every pixel; 0 far from all."""
     window = scaled_window(_SMOOTH_PX, mask.shape[1]).shape
-    weight = cv2.blur(mask.astype(np.float32), window)
-    return cv2.blur(flow * mask[..., None], window) / np.maximum(weight, 1e-6)[..., None]
+    mean, box = np.zeros_like(flow), box_about(mask)
+    if mask[box].size:
+        weight = cv2.blur(mask[box].astype(np.float32), window)
+        mean[box] = cv2.blur(flow[box] * mask[box][..., None], window) / np.maximum(weight, 1e-6)[..., None]
+    return mean
 
 
 def _vote(
