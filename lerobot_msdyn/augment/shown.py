@@ -23,7 +23,7 @@ def steps_with_sheet(path: Path, key: str, fps: int | float) -> dict[str, Step]:
     """The steps of a reconstruction, and one that draws the priors of the video's first window to `path`."""
 
     def draw(draft: Draft) -> None:
-        if not path.exists():
+        if draft.before is None:
             write_jpeg(path, contact_sheet([(key, draft.view, draft.priors)], fps, COLUMNS))
 
     return STEPS | {"sheet": draw}

@@ -112,7 +112,8 @@ def _instances(rgb: UInt8[ndarray, "h w 3"], priors: Priors, frame: int) -> UInt
 
 def depth_range(priors: Priors) -> tuple[float, float]:
     """Near and far end (m) of the colour map: 2 and 98 % of the known depths of the clip."""
-    known = priors.depth[priors.depth > 0].numpy()
+    depth = priors.depth.numpy()
+    known = depth[depth > 0]
     if len(known) == 0:
         return 0.1, 1.0
     near, far = np.percentile(known[:: max(1, len(known) // 100_000)], (2, 98))

@@ -6,8 +6,10 @@ another step in some place, as an ablation does, passes `with_steps(fit=its_own)
 
 import functools
 import logging
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -53,12 +55,32 @@ from lerobot_msdyn.scene.dynamic import DynamicScene
 logger = logging.getLogger(__name__)
 
 FURTHER_STEPS = 0.6  # share of the fit's steps that suffices where the static set has been fitted already
+WINDOWS_AT_ONCE = 2  # windows of a video that are worked on beside each other, where there are the cores
+
+
+class StoppedError(Exception):
+    """Nobody waits for the reconstruction any more."""
+
+
+@dataclass(frozen=True)
+class Handed:
+    """What stands still as the first window from a place shows it, handed from each window to the next."""
+
+    empty: Future[SharedBackground | None] = field(default_factory=Future)  # once its background is known
+    fitted: Future[SharedBackground | None] = field(default_factory=Future)  # the same with a set, once that is fitted
+
+    def fail(self, error: BaseException) -> None:
+        """Let who waits for it fail as well."""
+        for future in (self.empty, self.fitted):
+            if not future.done():
+                future.set_exception(error)
 
 
 @dataclass
 class Draft:
     """One window of a video on its way to a fitted scene; every step reads what earlier ones set, and sets its own."""
 
+    start: int  # its first frame in the video
     view: View  # at the size at which it is fitted; from the step `priors` on with the camera that is used
     recipe: Recipe
     recorded_width: int  # px, of the video's own pictures
@@ -69,8 +91,9 @@ class Draft:
     elsewhere: Sequence[Shown] = ()  # what other episodes show before a camera that moves
     path: CameraPath | None = None  # from the camera's usual place to where it is at each frame; None: it keeps still
     shared: SharedBackground | None = None  # the one that fits this window
-    first: SharedBackground | None = None  # what the first window from the same place shows where nothing moves
-    differs: Bool[Tensor, "h w"] | None = None  # where this one shows something else; None: there is no first one
+    before: Handed | None = None  # by the window before this one
+    handed: Handed = field(default_factory=Handed)  # by this one
+    differs: Bool[Tensor, "h w"] | None = None  # where it is not what the first window shows; None: it is the first
     priors: Priors = field(init=False)
     keys: Sequence[KeyView] = field(init=False)  # what stands still
     distance: float = field(init=False)  # m, to the look-at point
@@ -95,11 +118,36 @@ class Draft:
             x, y, z = self.view.camera.camera_from_world[0, :3, 2].tolist()
             self.up = x, y, z
 
-    def window(self, start: int) -> FittedWindow:
+    def hand_on(self, done: str) -> None:
+        """Give what stands still to the next window, once a step has found it."""
+        if done in ("background", "fit"):
+            future = "empty" if done == "background" else "fitted"
+            first = None if self.before is None else getattr(self.before, future).result()
+            if self.differs is None and self.view.camera.is_static:
+                static = None if done == "background" else to_device(self.fitted.scene.static, "cpu")
+                camera = self.view.camera.select([0])
+                first = SharedBackground(self.keys[0].empty, camera, self.view.rgb[:0], static)
+            getattr(self.handed, future).set_result(first)
+
+    def made(self) -> "Made":
         """What all steps have made, on the host."""
         scene, evidence = to_device((self.scene, self.evidence), "cpu")
-        fitted = self.fitted
-        return FittedWindow(start, scene, evidence, self.self_check, fitted.steps, fitted.train_psnr_db, self.seconds)
+        fitted, priors = self.fitted, self.priors
+        window = FittedWindow(
+            self.start, scene, evidence, self.self_check, fitted.steps, fitted.train_psnr_db, self.seconds
+        )
+        return Made(window, priors.metric, priors.provenance, self.distance, self.up)
+
+
+@dataclass(frozen=True)
+class Made:
+    """What is left of a draft."""
+
+    window: FittedWindow
+    metric: bool
+    provenance: dict[str, dict[str, str]]
+    distance: float
+    up: tuple[float, float, float]
 
 
 Step = Callable[[Draft], None]
@@ -129,10 +177,11 @@ def _background(draft: Draft) -> None:
         keys = with_shown(keys, draft.view, elsewhere, refine=refine)
     if draft.shared is not None:
         keys = fixed_view(completed(keys[0].empty, draft.shared.empty, len(draft.view)), draft.view.camera)
-    if draft.first is not None and draft.first.fits(draft.view):
+    first = None if draft.before is None else draft.before.empty.result()
+    if first is not None and first.fits(draft.view):
         empty = keys[0].empty
-        draft.differs = differing(draft.first.empty, empty)
-        keys = fixed_view(continued(draft.first.empty, empty, draft.differs), draft.view.camera)
+        draft.differs = differing(first.empty, empty)
+        keys = fixed_view(continued(first.empty, empty, draft.differs), draft.view.camera)
     draft.stand_before(keys)
 
 
@@ -166,11 +215,12 @@ def _fit(draft: Draft) -> None:
 
 def _continued(scene: DynamicScene, draft: Draft) -> DynamicScene:
     """With what stands still as it was fitted in the first window, so that nothing jumps where the next one begins."""
-    if draft.differs is None or draft.first is None or draft.first.static is None:
+    if draft.differs is None or draft.before is None:
         return scene
-    if len(scene.static) != len(draft.first.static):  # density control gives every window Gaussians of its own
-        return scene
-    return replace(scene, static=exchanged(to_device(draft.first.static, scene.device), scene.static, draft.differs))
+    first = draft.before.fitted.result()
+    if first is None or first.static is None or len(scene.static) != len(first.static):
+        return scene  # density control gives every window Gaussians of its own
+    return replace(scene, static=exchanged(to_device(first.static, scene.device), scene.static, draft.differs))
 
 
 def _prune(draft: Draft) -> None:
@@ -254,7 +304,8 @@ def reconstruct(
     """Priors, initial scene and fit of one camera's video; the first of the shared backgrounds that fits is used.
 
     Videos are cut where the camera was moved, and long ones into windows, each with priors and a scene of its own, so
-    that memory beyond the video itself is that of one window. Windows share a background as episodes do. The fit runs
+    that memory beyond the video itself is that of two windows, which are worked on at once. Windows share a background
+    as episodes do. The fit runs
     on the recipe's device; the result is on the host.
 
     Args:
@@ -280,51 +331,64 @@ def reconstruct(
     elsewhere = [shown for shown in backgrounds if isinstance(shown, Shown) and shown.episode != episode]
     small_others = [other.shrunk(recipe.fit.max_width) for other in others]
     device = chosen_device(recipe.device)
-    fitted: list[FittedWindow] = []
-    first: SharedBackground | None = None
-    metric, provenance, distances, ups = [], [], [], []
-    for part in parts:
-        frames = slice(part.start, part.start + len(part.view))
-        estimate = functools.partial(
-            estimate_priors,
-            config=recipe.priors,
-            camera=recipe.camera,
-            others=[other.select(frames) for other in small_others],
-            episode=episode,
-            key=key,
-            device=recipe.device,
-        )
+    stopped = threading.Event()
 
-        def within(share: float) -> object:
-            return progress(share / len(parts))
+    def within(share: float) -> object:
+        if stopped.is_set():
+            raise StoppedError
+        return progress(share / len(parts))
 
-        small = part.view.shrunk(recipe.fit.max_width)
-        draft = Draft(
-            small, recipe, view.camera.width, estimate, places, within, device, elsewhere, part.path, first=first
-        )
+    def drafts() -> Iterator[Draft]:
+        before: Handed | None = None
+        for part in parts:
+            frames = slice(part.start, part.start + len(part.view))
+            estimate = functools.partial(
+                estimate_priors,
+                config=recipe.priors,
+                camera=recipe.camera,
+                others=[other.select(frames) for other in small_others],
+                episode=episode,
+                key=key,
+                device=recipe.device,
+            )
+
+            small = part.view.shrunk(recipe.fit.max_width)
+            path, width = part.path, view.camera.width
+            draft = Draft(
+                part.start, small, recipe, width, estimate, places, within, device, elsewhere, path, before=before
+            )
+            before = draft.handed
+            yield draft
+
+    at_once = min(WINDOWS_AT_ONCE, len(parts)) if device.type == "cpu" else 1
+    made = [*in_threads(functools.partial(_made, steps, stopped), drafts(), at_once, stopped.set)]
+    camera = concatenated([one.window.evidence.camera for one in made])
+    return Reconstruction(
+        windows=tuple(one.window for one in made),
+        metric=all(one.metric for one in made),
+        provenance=merged([one.provenance for one in made]),
+        camera=camera.resized(view.camera.width, view.camera.height),
+        distance=made[0].distance,
+        up=made[0].up,
+        stands=stands,
+    )
+
+
+def _made(steps: dict[str, Step], stopped: threading.Event, draft: Draft) -> Made:
+    """What all steps make of a draft."""
+    try:
         with torch_on_one_thread():
             for name, step in steps.items():
+                if stopped.is_set():
+                    raise StoppedError
                 begin = time.perf_counter()
                 step(draft)
                 draft.seconds[name] = time.perf_counter() - begin
-        fitted.append(draft.window(part.start))
-        if draft.differs is None and draft.view.camera.is_static:
-            static = to_device(draft.fitted.scene.static, "cpu")
-            first = SharedBackground(draft.keys[0].empty, draft.view.camera.select([0]), part.view.rgb[:0], static)
-        metric.append(draft.priors.metric)
-        provenance.append(draft.priors.provenance)
-        distances.append(draft.distance)
-        ups.append(draft.up)
-    camera = concatenated([window.evidence.camera for window in fitted])
-    return Reconstruction(
-        windows=tuple(fitted),
-        metric=all(metric),
-        provenance=merged(provenance),
-        camera=camera.resized(view.camera.width, view.camera.height),
-        distance=distances[0],
-        up=ups[0],
-        stands=stands,
-    )
+                draft.hand_on(name)
+    except BaseException as error:
+        draft.handed.fail(error)
+        raise
+    return draft.made()
 
 
 def _shared_by_windows(

@@ -74,13 +74,20 @@ def run(kernel: Callable[..., None], items: int, *arguments: Any) -> None:
             future.result()
 
 
-def in_threads[A, B](function: Callable[[A], B], items: Iterable[A]) -> Iterator[B]:
+def in_threads[A, B](
+    function: Callable[[A], B],
+    items: Iterable[A],
+    at_once: int | None = None,
+    stop: Callable[[], object] = lambda: None,
+) -> Iterator[B]:
     """What a function makes of each item, in their order, on as many threads as this process may use.
 
-    Torch, NumPy, OpenCV and the kernels let others run while they compute; within the function each has one thread.
-    Few items are taken ahead of what is asked for, so that memory stays bounded.
+    Torch, NumPy, OpenCV and the kernels let others run while they compute; within the function each has one thread, or
+    its share of the threads, if only so many items are worked on `at_once`. Few items are taken ahead of what is asked
+    for, so that memory stays bounded. What is under way when nobody asks any more is waited for; `stop` is called then.
     """
-    count = threads()
+    count = min(threads(), at_once or threads())
+    share = threads() // count
     if count == 1:
         yield from map(function, items)
         return
@@ -92,7 +99,7 @@ def in_threads[A, B](function: Callable[[A], B], items: Iterable[A]) -> Iterator
             return function(item)
 
     waiting: deque[Future[B]] = deque()
-    with ThreadPoolExecutor(count, "items", initializer=_threads.set, initargs=(1,)) as pool:
+    with ThreadPoolExecutor(count, "items", initializer=_threads.set, initargs=(share,)) as pool:
         try:
             for item in items:
                 waiting.append(pool.submit(call, item))
@@ -101,6 +108,7 @@ def in_threads[A, B](function: Callable[[A], B], items: Iterable[A]) -> Iterator
             while waiting:
                 yield waiting.popleft().result()
         finally:
+            stop()
             for future in waiting:
                 future.cancel()
             torch.set_num_threads(before)
