@@ -185,18 +185,21 @@ def _follow(
     frames = len(video.labels)
     nothing = np.zeros((0, 2), np.float32)
     points = _start(video, 0, _new_points(video.labels[0], nothing, grid))
-    starts, history = [points], [points]  # the tracks that begin at frames 0, restart_every, ...
+    starts, history = (
+        [points],
+        [(points.xy, points.confidence)],
+    )  # the tracks that begin at frames 0, restart_every, ...
     for target in range(1, frames):
         points = _advance(video, points, target - 1, target, min_ncc)
         if target % restart_every == 0:
             followed = points.xy[points.confidence > 0]
             starts.append(_start(video, target, _new_points(video.labels[target], followed, grid)))
             points = points.joined(starts[-1])
-        history.append(points)
+        history.append((points.xy, points.confidence))  # without the anchors, most of the memory
     count = len(points.xy)
     xy, confidence = np.zeros((count, frames, 2), np.float32), np.zeros((count, frames), np.float32)
-    for t, points in enumerate(history):
-        xy[: len(points.xy), t], confidence[: len(points.xy), t] = points.xy, points.confidence
+    for t, (places, sure) in enumerate(history):
+        xy[: len(places), t], confidence[: len(places), t] = places, sure
     points = _start(video, 0, nothing)
     for target in range(frames - 2, -1, -1):
         block, offset = divmod(target + 1, restart_every)
