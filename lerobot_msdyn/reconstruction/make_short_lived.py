@@ -84,6 +84,7 @@ def short_lived_of(scene: DynamicScene, view: View, priors: Priors, reach: int, 
         hidden=packed_rows([torch.zeros(own, dtype=torch.bool)] * count),
     )
     with_them = replace(host, short_lived=unhidden)
+    moving = torch.arange(own) >= len(scene.static)
 
     def hidden(frame: int) -> Bool[Tensor, " g"]:
         if frame in keys:
@@ -91,7 +92,7 @@ def short_lived_of(scene: DynamicScene, view: View, priors: Priors, reach: int, 
         patch = with_them.short_lived_patch(frame)
         assert patch is not None
         covered = torch.from_numpy(_covered(patch.means, comparison, frame) & wrong[frame])
-        return comparison.hidden(comparison.snapshot(frame), frame, covered, covered)
+        return comparison.hidden(scene.positions(torch.tensor([frame]))[0], moving, frame, covered, covered)
 
     found = replace(unhidden, hidden=packed_rows([*everywhere(hidden, range(count))]))
     each = len(found.shown) / max(len(found.means), 1)

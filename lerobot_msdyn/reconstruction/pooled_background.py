@@ -18,7 +18,7 @@ from lerobot_msdyn.core.sampling import evenly, scaled_px, scaled_window
 from lerobot_msdyn.core.serialise import from_named_tensors, named_tensors
 from lerobot_msdyn.priors.camera.stands import is_displaced
 from lerobot_msdyn.priors.depth.flying_pixels import clean_recorded_depth
-from lerobot_msdyn.priors.masks.moving import temporal_median
+from lerobot_msdyn.priors.masks.moving import median_picture
 from lerobot_msdyn.reconstruction.background import MARGIN_PX, SAMPLES, EmptyScene, empty_scene
 from lerobot_msdyn.scene.gaussians import Gaussians, rgb_to_sh
 
@@ -54,7 +54,7 @@ class SharedBackground:
         same = torch.equal(camera.intrinsics[0], self.camera.intrinsics[0]) and torch.equal(
             camera.world_from_camera[0], self.camera.world_from_camera[0]
         )
-        picture = temporal_median(view.rgb[few(len(view.rgb))])[0]
+        picture = median_picture(view.rgb[few(len(view.rgb))])
         return same and from_one_place(picture, self.empty.rgb)
 
 
@@ -68,7 +68,7 @@ def same_places(views: list[View]) -> list[list[int]]:
     for number, view in enumerate(views):
         if not view.camera.is_static:
             continue
-        picture = temporal_median(view.rgb)[0]
+        picture = median_picture(view.rgb)
         near = [i for i, other in enumerate(pictures) if from_one_place(picture, other)]
         if near:
             groups[min(near, key=lambda i: shift_px(picture.numpy(), pictures[i].numpy()))].append(number)

@@ -80,7 +80,7 @@ class Comparison:
         """
         picture, depth, chosen = self.view.rgb[frame], self.depth(frame), torch.from_numpy(taken)
         pixels = pixel_gaussians(picture, depth, self.view.camera, frame, where=chosen)[0]
-        hidden = self.hidden(snapshot, frame, torch.from_numpy(wrong), chosen)
+        hidden = self.hidden(snapshot.means[0], snapshot.moving > 0, frame, torch.from_numpy(wrong), chosen)
         log_scales, recorded = pixels.log_scales + math.log(SCALE), picture[chosen].float() / 255
         first = FramePatch(pixels.means, pixels.quats, log_scales, recorded, hidden)
         if len(first) == 0:
@@ -95,12 +95,17 @@ class Comparison:
         return replace(first, rgb=(recorded + lacking).clamp(0, 1.5))
 
     def hidden(
-        self, snapshot: Snapshot, frame: int, wrong: Bool[Tensor, "h w"], taken: Bool[Tensor, "h w"]
+        self,
+        means: Float[Tensor, "g 3"],
+        moving: Bool[Tensor, " g"],
+        frame: int,
+        wrong: Bool[Tensor, "h w"],
+        taken: Bool[Tensor, "h w"],
     ) -> Bool[Tensor, " g"]:
         """Gaussians on or before the recorded surface: moving ones where it is wrong, others where it is replaced."""
-        snapshot = to_device(snapshot, "cpu")
-        seen = projected(snapshot.means[0], self.view.camera.select([frame]))
-        replaced = torch.where(snapshot.moving > 0, wrong[seen.pixel], taken[seen.pixel])
+        means, moving = to_device((means, moving), "cpu")
+        seen = projected(means, self.view.camera.select([frame]))
+        replaced = torch.where(moving, wrong[seen.pixel], taken[seen.pixel])
         return replaced & seen.visible(self.depth(frame), THICKNESS)
 
     def _pose(self, frame: int) -> CameraTrack:

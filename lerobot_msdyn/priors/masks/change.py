@@ -5,6 +5,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, UInt8
 from numpy import ndarray
 
+from lerobot_msdyn.render.cpu.threads import in_threads
+
 _NOISE_CEILING = 2.0  # times the image's median noise: a pixel that is often covered only looks noisy
 _TEXTURE_WINDOW = 7  # px
 _TEXTURE_NOISE = 2.0  # Lab units; flatter than this, a window has no texture
@@ -72,7 +74,7 @@ def changes(
 ) -> Bool[ndarray, "t h w"]:
     """Pixels of each frame that show something else than the reference does, neighbours deciding together."""
     before = Reference(reference, noise)
-    return np.stack([along_edges(before.change(frame), frame) > 0 for frame in frames])
+    return np.stack([*in_threads(lambda frame: along_edges(before.change(frame), frame) > 0, frames)])
 
 
 class _Texture:

@@ -44,6 +44,11 @@ _SELDOM = 0.05  # share of the frames; a pixel that changes in fewer may be stat
 _MIN_AREA = 5e-4  # of the image; smaller blobs are dropped
 
 
+def median_picture(frames: UInt8[Tensor, "t h w 3"]) -> UInt8[Tensor, "h w 3"]:
+    """Median colour of every pixel over at most 60 evenly spread frames."""
+    return torch.from_numpy(np.median(_spread(frames.cpu().numpy(), _MEDIAN_SAMPLES), axis=0).astype(np.uint8))
+
+
 def temporal_median(
     rgb: UInt8[Tensor, "t h w 3"], others: UInt8[Tensor, "m h w 3"] | None = None
 ) -> tuple[UInt8[Tensor, "h w 3"], Float32[Tensor, "h w"]]:

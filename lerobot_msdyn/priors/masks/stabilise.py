@@ -5,6 +5,8 @@ import numpy as np
 from jaxtyping import Float32, Shaped, UInt8
 from numpy import ndarray
 
+from lerobot_msdyn.render.cpu.threads import in_threads
+
 _CORNERS = 400
 _MIN_CORNERS = 12  # that must agree on a frame's motion
 _AGREE_PX = 0.75
@@ -23,7 +25,9 @@ def camera_sway(
     corners = cv2.goodFeaturesToTrack(grey, _CORNERS, 0.01, 5)
     if corners is None or len(corners) < _MIN_CORNERS:
         return None
-    motions = np.stack([_motion(grey, cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), corners) for frame in frames])
+    motions = np.stack(
+        [*in_threads(lambda frame: _motion(grey, cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), corners), frames)]
+    )
     height, width = grey.shape
     ends = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], np.float32)
     moved = np.linalg.norm(ends @ motions.transpose(0, 2, 1) - ends[:, :2], axis=-1)
