@@ -48,6 +48,8 @@ def render_scene(
         for i, frame in enumerate(frames.tolist())
         if (patch := scene.patch(frame)) is not None
     ]
+    if len(parts) == 1:
+        return parts[0]
     names = [item.name for item in fields(Rendering) if getattr(parts[0], item.name) is not None]
     return Rendering(**{name: torch.cat([getattr(one, name) for one in parts]) for name in names})
 

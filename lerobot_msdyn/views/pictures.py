@@ -62,8 +62,8 @@ def new_pictures(
 def _composed(rendered: Rendered, *, metric: bool) -> list[Picture]:
     """Pictures with what is behind in their holes."""
     rendering, of_frames, behind = rendered
-    composed = (rendering.rgb + missing(rendering.alpha)[..., None] * behind).clamp(0, 1)
-    rgb, depths = to_device(((composed * 255).round().to(torch.uint8), rendering.depth), "cpu")
+    composed = (rendering.rgb + missing(rendering.alpha)[..., None] * behind).clamp_(0, 1)
+    rgb, depths = to_device((composed.mul_(255).round_().to(torch.uint8), rendering.depth), "cpu")
     return [
         Picture(picture.numpy(), np.where(~coverage.empty & metric, depth.numpy(), np.float32(0)), coverage.unseen)
         for picture, depth, coverage in zip(rgb, depths, of_frames, strict=True)
