@@ -1,6 +1,7 @@
 """From a video to its scenes and new pictures, also where the video is not as one would wish."""
 
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import torch
 
 from lerobot_msdyn.augment.episode import by_feature
 from lerobot_msdyn.core.config import Recipe
+from lerobot_msdyn.core.errors import EpisodeError
 from lerobot_msdyn.core.observations import DepthTraits, View
 from lerobot_msdyn.dataset.read import open_source
 from lerobot_msdyn.priors import Priors, estimate_priors
@@ -28,6 +30,13 @@ def pushed() -> View:
     scene = make_scene("push", 0, FRAMES, WIDTH, HEIGHT)
     seen = scene.render(scene.camera)
     return View(seen.rgb, scene.camera, seen.depth)
+
+
+@pytest.fixture
+def restore_threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
 
 
 def recipe(steps: int = 10) -> Recipe:
@@ -113,10 +122,8 @@ def test_lost_tracks(pushed: View, monkeypatch: pytest.MonkeyPatch, lost: str) -
 
 
 def test_windows_whose_priors_differ_say_so(pushed: View, monkeypatch: pytest.MonkeyPatch) -> None:
-    known = iter([True, False])
-
-    def estimated(*arguments: Any, **named: Any) -> Priors:
-        priors, metric = estimate_priors(*arguments, **named), next(known)
+    def estimated(view: View, **named: Any) -> Priors:
+        priors, metric = estimate_priors(view, **named), torch.equal(view.rgb[0], pushed.rgb[0])
         depth = {"provider": "recorded" if metric else "plane", "why": "of this test"}
         traits = DepthTraits(metric=metric)
         return dataclasses.replace(priors, depth_traits=traits, provenance=priors.provenance | {"depth": depth})
@@ -136,6 +143,39 @@ def test_windows_show_the_same_where_nothing_moves(pushed: View) -> None:
     first, second = (window.scene for window in reconstruct(pushed, settings).windows)
     assert (first.static.means == second.static.means).all(-1).float().mean() > 0.7
     assert (first.static.sh == second.static.sh).flatten(1).all(-1).float().mean() > 0.7
+
+
+@pytest.mark.parametrize("threads", [1, 2, 4])
+def test_windows_do_not_depend_on_how_many_are_worked_on_at_once(
+    pushed: View, threads: int, restore_threads: None
+) -> None:
+    settings = recipe()
+    settings.fit.window_frames = 5
+    torch.set_num_threads(1)
+    expected = reconstruct(pushed, settings)
+    torch.set_num_threads(threads)
+    for one, other in zip(reconstruct(pushed, settings).windows, expected.windows, strict=True):
+        assert one.start == other.start
+        for name, tensor in one.scene.tensors().items():
+            assert torch.equal(tensor, other.scene.tensors()[name]), name
+
+
+@pytest.mark.parametrize("step", ["priors", "fit", "overlay"])
+def test_a_fault_in_one_window_ends_the_others(pushed: View, step: str, restore_threads: None) -> None:
+    done: list[int] = []
+
+    def broken(draft: pipeline.Draft) -> None:
+        done.append(draft.start)
+        if draft.start == 0:
+            raise EpisodeError("of this test")
+        pipeline.STEPS[step](draft)
+
+    settings = recipe()
+    settings.fit.window_frames = 2
+    torch.set_num_threads(2)
+    with pytest.raises(EpisodeError, match="of this test"):
+        reconstruct(pushed, settings, steps=pipeline.with_steps({step: broken}))
+    assert len(done) <= 3  # of six windows
 
 
 def test_a_long_video_is_fitted_in_windows(pushed: View) -> None:

@@ -140,6 +140,25 @@ def test_items_in_threads_come_in_their_order_and_few_ahead(count, restore_threa
     assert torch.get_num_threads() == count
 
 
+def test_fewer_items_at_once_have_more_threads_each(restore_threads):
+    torch.set_num_threads(4)
+    assert list(in_threads(lambda item: (item, threads()), range(3), at_once=2)) == [(0, 2), (1, 2), (2, 2)]
+    assert list(in_threads(lambda item: (item, threads()), range(3), at_once=1)) == [(0, 4), (1, 4), (2, 4)]
+
+
+def test_what_is_under_way_is_told_to_stop(restore_threads):
+    torch.set_num_threads(2)
+    stopped = threading.Event()
+
+    def waits(item):
+        if item == 0:
+            raise ValueError("zero")
+        assert stopped.wait(60)
+
+    with pytest.raises(ValueError, match="zero"):
+        list(in_threads(waits, range(10), stop=stopped.set))
+
+
 def test_a_fault_in_a_thread_comes_out_and_ends_the_rest(restore_threads):
     torch.set_num_threads(2)
 
