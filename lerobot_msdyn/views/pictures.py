@@ -22,7 +22,8 @@ from lerobot_msdyn.views.filling import filled, missing
 
 logger = logging.getLogger(__name__)
 
-BATCH = 4  # frames that a GPU renders at a time; each thread of the CPU renders one, which stays in its cache
+BATCH = 4  # frames that are rendered at a time ...
+PIXELS_AT_ONCE = BATCH * 320 * 240  # ... as far as a thread of the CPU has room for them in its cache
 Rendered = tuple[Rendering, list[Coverage], Float[Tensor, "#t #h #w 3"]]  # frames, their coverage, what fills holes
 
 
@@ -124,7 +125,7 @@ def _rendered[T](
         still = _still(window, poses, times, fill) if poses.is_static else None
         some = functools.partial(_some_made, made, window, poses, times, fill, still)
         on_cpu = window.scene.device.type == "cpu"
-        size = 1 if on_cpu else BATCH
+        size = min(BATCH, max(1, PIXELS_AT_ONCE // (camera.width * camera.height))) if on_cpu else BATCH
         batches = [slice(start, min(start + size, len(times))) for start in range(0, len(times), size)]
         yield from in_threads(some, batches) if on_cpu else map(some, batches)
 
