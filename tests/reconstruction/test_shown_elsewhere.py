@@ -153,7 +153,7 @@ def test_an_episode_is_looked_at_only_where_its_poses_can_be_compared(
     write_exchange(tmp_path / "poses.npz", content)
     settings = Recipe()
     settings.camera.poses = str(tmp_path / "poses.npz")
-    assert settings.camera.known_before
+    assert settings.camera.known_before("front")
     asked = []
 
     def true_priors(seen: View, *_: object, **__: object) -> Priors:
@@ -167,7 +167,7 @@ def test_an_episode_is_looked_at_only_where_its_poses_can_be_compared(
     assert (found is None) == (not world)
     for poses in ("auto", "fixed", "sfm"):
         settings.camera.poses = poses
-        assert not settings.camera.known_before
+        assert not settings.camera.known_before("front")
 
 
 def reconstructed(walked: Walked, backgrounds: list[Shown], episode: int = 0) -> Reconstruction:
