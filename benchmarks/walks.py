@@ -6,8 +6,9 @@
 Episode 0 is recorded from -25 to -5 degrees of azimuth about a simulated desk, the others from -10 to 20; the arm
 pushes a block in each, from another place. Episode 0 is seen from 12 degrees further on, and from 12 degrees back,
 where nobody was. Depth is recorded, or as a network would give it, in metres or as inverse depth without factor and
-shift; poses are those of the simulation (`--noise` adds some), masks and tracks are the product's own. PSNR against the truth, of what stands still: where episode 0 alone covers the view ("own"), and where
-sharing covers it in addition ("new").
+shift; poses are those of the simulation (`--noise` adds some), masks and tracks are the product's own. PSNR against the
+truth, of what stands still: where episode 0 alone covers the view ("own"), and where sharing covers it in addition
+("new").
 """
 
 import argparse

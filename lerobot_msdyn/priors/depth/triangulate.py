@@ -48,7 +48,7 @@ def matched_points(features: Features, others: Features, camera: CameraTrack, ot
     if min(len(features.xy), len(others.xy)) < 2:
         return np.zeros((0, 3), np.float32)
     pairs = np.array(_mutual(features.descriptors, others.descriptors), int).reshape(-1, 2)
-    return _triangulated(features.xy[pairs[:, 0]], others.xy[pairs[:, 1]], camera, other)
+    return triangulated(features.xy[pairs[:, 0]], others.xy[pairs[:, 1]], camera, other)
 
 
 def confirmed(points: list[Points]) -> Points:
@@ -91,10 +91,13 @@ def _mutual(a: Float32[ndarray, "n d"], b: Float32[ndarray, "m d"]) -> list[tupl
     return [(m.queryIdx, m.trainIdx) for m in there if back[m.trainIdx] == m.queryIdx]
 
 
-def _triangulated(
+def triangulated(
     a: Float[ndarray, "n 2"], b: Float[ndarray, "n 2"], camera: CameraTrack, other: CameraTrack
 ) -> Float32[ndarray, "m 3"]:
-    """Pairs of pixels as points of the first camera, without those that do not fit the calibration."""
+    """Pairs of pixels as x, y (px) and z-depth (m) in the first camera, without those that do not fit the two's poses.
+
+    Of either camera the first frame counts.
+    """
     pose = relative_pose(camera, other)
     k_a, k_b = (c.intrinsics[0].double().numpy() for c in (camera, other))
     project_a, project_b = k_a @ np.eye(3, 4), k_b @ pose[:3]
