@@ -108,8 +108,9 @@ class RobotConfig:
 class PriorsConfig:
     """What is known about a video before the fit: each by a provider (docs/priors.md), yours too (--plugins)."""
 
-    # auto (recorded, else a learned model that is on this machine, else stereo, else plane), recorded, plane,
-    # depth_anything, depth_anything_metric, onnx:FILE.onnx, stereo (two or more calibrated cameras), or an .npz file.
+    # auto (recorded, else a learned model that is on this machine, else stereo, parallax or plane), recorded, plane,
+    # depth_anything, depth_anything_metric, onnx:FILE.onnx, stereo (two or more calibrated cameras), parallax (a camera
+    # that moves, with poses), or an .npz file.
     depth: str = one_of(AUTO, (AUTO,), registry=DEPTH)
     # auto (a learned model that is on this machine, else change), change, sam2, edgetam, onnx:FOLDER, or an .npz file.
     masks: str = one_of(AUTO, (AUTO,), registry=MASKS)

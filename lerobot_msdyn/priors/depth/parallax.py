@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Bool, Float32, UInt8
 from numpy import ndarray
 
 from lerobot_msdyn.core.cameras import CameraTrack
@@ -13,7 +13,7 @@ from lerobot_msdyn.core.errors import PriorError
 from lerobot_msdyn.priors.depth.triangulate import Points, spread, triangulated
 
 _FRAMES = 48  # in which corners are looked for
-_APART = (0.05, 0.15)  # of the clip, to either side: where they are looked for again
+_APART = (0.15, 0.05)  # of the clip, to either side: where they are looked for again, the surest first
 _NEAR = 0.1  # of the clip, to either side: whose corners say how deep a frame is
 _NEAREST = 3  # frames with corners, at least
 _LEAST = 100  # points, together
@@ -25,7 +25,8 @@ type Instances = UInt8[ndarray, "t h w"]
 def parallax_points(camera: CameraTrack, rgb: Frames, instances: Instances) -> dict[int, Points]:
     """x, y (px) and z-depth (m) of corners of what stands still, in some frames.
 
-    Corners that several other frames tell are taken where these agree.
+    What other frames tell of a corner must agree. One on what is said to move needs two of them: masks that were made
+    without poses say so of much that stands still.
 
     Raises:
         PriorError: hardly any are found, or the camera only turns.
@@ -42,13 +43,13 @@ def parallax_points(camera: CameraTrack, rgb: Frames, instances: Instances) -> d
 
     found: dict[int, Points] = {}
     for frame in looked_at:
-        usable, told = away_from(instances[frame] > 0), []
+        still, told = away_from(instances[frame] > 0) > 0, []
         for other in (frame + gap for gap in apart):
             if 0 <= other < frames:
-                here, there = corners_followed(picture(frame), picture(other), usable)
+                here, there = corners_followed(picture(frame), picture(other))
                 cameras = camera.select([frame]), camera.select([other])
                 told.append(triangulated(here + 0.5, there + 0.5, *cameras))
-        found[frame] = _agreed(told)
+        found[frame] = _agreed(told, still)
     count = sum(len(points) for points in found.values())
     if count < _LEAST:
         raise PriorError(
@@ -58,16 +59,19 @@ def parallax_points(camera: CameraTrack, rgb: Frames, instances: Instances) -> d
     return found
 
 
-def _agreed(told: Sequence[Points]) -> Points:
-    """Of corners that a frame has, each once, at the median depth, without those about which others differ."""
+def _agreed(told: Sequence[Points], still: Bool[ndarray, "h w"]) -> Points:
+    """Of the corners that a frame has, each once, as the first of the others says that knows it, if all agree."""
     gathered = np.concatenate(told) if told else np.zeros((0, 3), np.float32)
     if len(gathered) == 0:
         return gathered
-    _, corner = np.unique(gathered[:, :2], axis=0, return_inverse=True)
-    points = np.stack([np.median(gathered[corner == index], axis=0) for index in range(int(corner.max()) + 1)])
+    _, first, corner, often = np.unique(
+        gathered[:, :2], axis=0, return_index=True, return_inverse=True, return_counts=True
+    )
+    points = gathered[first]
     off = np.zeros(len(points))
     np.maximum.at(off, corner, np.abs(gathered[:, 2] / points[corner, 2] - 1))
-    kept: Points = points[off < _SAME].astype(np.float32)
+    column, row = points[:, :2].astype(int).T
+    kept: Points = points[(off < _SAME) & ((often > 1) | still[row, column])]
     return kept
 
 

@@ -105,12 +105,14 @@ def triangulated(
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ pose[:3, :3]
     fundamental = np.linalg.inv(k_b).T @ essential @ np.linalg.inv(k_a)
     lines = np.c_[a, np.ones(len(a))] @ fundamental.T
-    off = np.abs((np.c_[b, np.ones(len(b))] * lines).sum(1)) / np.linalg.norm(lines[:, :2], axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):  # cameras in one place
+        off = np.abs((np.c_[b, np.ones(len(b))] * lines).sum(1)) / np.linalg.norm(lines[:, :2], axis=1)
     a, b = a[off < _EPIPOLAR_PX], b[off < _EPIPOLAR_PX]
     if len(a) == 0:
         return np.zeros((0, 3), np.float32)
     points = cv2.triangulatePoints(project_a, project_b, a.T, b.T)
-    points = (points[:3] / points[3]).T
+    with np.errstate(divide="ignore", invalid="ignore"):  # rays that do not meet
+        points = (points[:3] / points[3]).T
     there = points @ pose[:3, :3].T + pose[:3, 3]
     centre = -pose[:3, :3].T @ pose[:3, 3]
     towards = points - centre
