@@ -64,7 +64,7 @@ def augment_episode(
     What an earlier run has finished of it is taken from the output's work folder.
 
     Raises:
-        EpisodeError: the episode cannot be read.
+        EpisodeError: the episode cannot be read or reconstructed.
         PriorError: a prior was demanded and cannot be had.
     """
     episode, defects = read_recorded(source, index, cameras, recipe)
@@ -94,7 +94,10 @@ def augment_episode(
             key=key,
             steps=steps_with_sheet(sheets[key], key, source.fps),
         )
-        scenes[key] = kept.keep(f"{SCENE}_{key}", make_scene)
+        try:
+            scenes[key] = kept.keep(f"{SCENE}_{key}", make_scene)
+        except EpisodeError as error:
+            raise EpisodeError(f"{source.repo_id} episode {index}, {key}: {error}") from error
     ready = {key: on_device(scene, chosen_device(recipe.device)) for key, scene in scenes.items()}
     priors = {key: scene.provenance for key, scene in scenes.items()}
     new = []
