@@ -1,12 +1,14 @@
 """What it is worth that episodes of a walking camera share what stands still: one view per seed, with and without.
 
     python benchmarks/walks.py --out FOLDER [--seeds 0 1 2] [--width 320] [--frames 24] [--steps 200] [--others 3]
+        [--depth recorded|network|disparity]
 
 Episode 0 is recorded from -25 to -5 degrees of azimuth about a simulated desk, the others from -10 to 20; the arm
 pushes a block in each, from another place. Episode 0 is seen from 12 degrees further on, and from 12 degrees back,
-where nobody was. Depth is recorded, poses are those of the simulation (`--noise` adds some), masks and tracks are the
-product's own. PSNR against the truth, of what stands still: where episode 0 alone covers the view ("own"), and where
-sharing covers it in addition ("new").
+where nobody was. Depth is recorded, or as a network would give it, in metres or as inverse depth without factor and
+shift; poses are those of the simulation (`--noise` adds some), masks and tracks are the product's own. PSNR against the
+truth, of what stands still: where episode 0 alone covers the view ("own"), and where sharing covers it in addition
+("new").
 """
 
 import argparse
@@ -27,6 +29,7 @@ from lerobot_msdyn.reconstruction.reconstruct import reconstruct
 from lerobot_msdyn.reconstruction.share_background import shown_by
 from lerobot_msdyn.render.cpu.threads import torch_on_one_thread
 from lerobot_msdyn.synthetic import make_scene
+from lerobot_msdyn.synthetic.rough_depth import rough_depth
 from lerobot_msdyn.synthetic.scene import SyntheticScene
 from lerobot_msdyn.synthetic.viewpoints import walking_camera
 from lerobot_msdyn.views.pictures import new_pictures
@@ -57,14 +60,22 @@ def recorded(
         w2c=w2c.float().numpy(),
         world="desk",
     )
+    depth = None
+    if options.depth != "recorded":
+        depth = rough_depth(seen.depth.numpy(), rng)
+        kind = "metric" if options.depth == "network" else "affine_disparity"
+        content = replace(content, depth=depth if kind == "metric" else 1 / depth + 0.3, depth_kind=kind)
     write_exchange(options.out / f"poses_{seed}_{episode}.npz", content)
     assumed = static_camera(camera.intrinsics[0], frames, width, height)
-    return scene, View(seen.rgb, assumed, seen.depth)
+    return scene, View(seen.rgb, assumed, seen.depth if depth is None else None)
 
 
 def measured(seed: int, recipe: Recipe, options: argparse.Namespace) -> list[dict[str, float]]:
     """The figures of one seed, a row per view."""
-    recipe = replace(recipe, camera=replace(recipe.camera, poses=f"{options.out}/poses_{seed}_{{episode}}.npz"))
+    file = f"{options.out}/poses_{seed}_{{episode}}.npz"
+    recipe = replace(recipe, camera=replace(recipe.camera, poses=file))
+    if options.depth != "recorded":
+        recipe = replace(recipe, priors=replace(recipe.priors, depth=file))
     scene, view = recorded(seed, 0, OWN, options)
     recordings = {episode: recorded(seed, episode, OTHERS, options)[1] for episode in range(1, options.others + 1)}
     start = time.process_time()
@@ -107,6 +118,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=24)
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--others", type=int, default=3, help="episodes beside")
+    parser.add_argument("--depth", choices=("recorded", "network", "disparity"), default="recorded")
     parser.add_argument("--noise", action="store_true", help="poses with 0.3 degrees and 3 mm of noise per frame")
     options = parser.parse_args()
     recipe = load_recipe("balanced")

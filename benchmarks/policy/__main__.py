@@ -31,7 +31,7 @@ from lerobot_msdyn.core.files import write_whole
 from .cameras import CAMERAS, Placement
 from .forms import FORMS, Form
 from .report import outcomes, plot, table
-from .sets import ROWS, SWEEPS, Row, Sets
+from .sets import ROWS, SWEEPS, WITH_DEPTH, Row, Sets
 from .store import Store
 
 if TYPE_CHECKING:
@@ -45,14 +45,14 @@ FREE = {"steps", "act_steps", "seeds", "cameras"}  # of a form, what may differ 
 class Study:
     """Trains and tests what is asked for."""
 
-    def __init__(self, out: Path, form: Form, policy: str, workers: int) -> None:
+    def __init__(self, out: Path, form: Form, policy: str, workers: int, depth_network: Path | None) -> None:
         """Nothing is made before it is asked for."""
         from .task import Task
 
         self.form, self.policy = form, policy
         self.name = name_of(policy, form)
         self.store = Store(out, {name: value for name, value in asdict(form).items() if name not in FREE})
-        self.sets = Sets(self.store, form, workers)
+        self.sets = Sets(self.store, form, workers, depth_network)
         self.task = Task()
 
     def run(self, rows: Mapping[str, Row]) -> None:
@@ -139,19 +139,24 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--form", choices=FORMS, default="reduced")
     parser.add_argument("--policy", choices=("small", "act"), default="small")
     of_rows = "; between them; those of sweeps, too"
-    parser.add_argument("--rows", type=lambda text: text.split(";"), default=list(ROWS), help=of_rows)
+    parser.add_argument("--rows", type=lambda text: text.split(";"), help=of_rows)
     parser.add_argument("--sweep", choices=SWEEPS, help="rows of this sweep beside transforms and oracle")
     parser.add_argument("--steps", type=int, default=0, help="gradient steps; 0: the form's")
     parser.add_argument("--seeds", type=int, default=0, help="trainings per row; 0: the form's")
     parser.add_argument("--workers", type=int, default=0, help="of augment; 0: one per core")
+    parser.add_argument("--depth_network", type=Path, help="FILE.onnx, for the row with a depth network")
     parser.add_argument("--pictures", action="store_true", help="compare the product's pictures with exact ones alone")
     parser.add_argument("--report", action="store_true", help="print the table of what is finished, and stop")
     options = parser.parse_args(arguments)
     known = ROWS | {name: row for sweep in SWEEPS.values() for name, row in sweep.items()}
-    unknown = sorted(set(options.rows) - set(known))
+    usual = [name for name, row in ROWS.items() if name != WITH_DEPTH and (options.depth_network or not row.network)]
+    chosen = options.rows or usual
+    unknown = sorted(set(chosen) - set(known))
     if unknown:
         parser.error(f"--rows has {unknown}; expected some of {list(known)}")
-    rows = {name: known[name] for name in options.rows}
+    rows = {name: known[name] for name in chosen}
+    if any(row.network for row in rows.values()) and not (options.depth_network and options.depth_network.is_file()):
+        parser.error(f"--depth_network is {options.depth_network}; expected a file of ONNX, which these rows need")
     if options.sweep:
         rows = {name: ROWS[name] for name in ("transforms", "oracle")} | SWEEPS[options.sweep]
     form = FORMS[options.form]
@@ -175,7 +180,7 @@ def main(arguments: list[str]) -> None:
     from lerobot_msdyn.dataset.video import quiet_encoders
 
     quiet_encoders()
-    study = Study(options.out, form, options.policy, options.workers)
+    study = Study(options.out, form, options.policy, options.workers, options.depth_network)
     try:
         if options.pictures:
             from . import pictures

@@ -56,6 +56,7 @@ FORMS = {
             "--scene.moving_frames=12",
         ),
         cameras=FEW,
+        tasks=160,
         seeds=2,
         steps=15000,
         input_width=96,

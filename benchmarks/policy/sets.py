@@ -31,17 +31,22 @@ FRONT, WRIST = "observation.images.front", "observation.images.wrist"
 RECORDED = "recorded"
 WITHOUT_JOINTS = "--camera.by_robot=false"
 WITH_JOINTS = ("--robot.name=so101",)
+WITH_DEPTH = f"{RECORDED} with depth"
 FITTED = "product with joints"  # whose scenes other rows are rendered from
 ENDS = Path(__file__).with_name("ends.py")  # a plugin
 Episode = tuple["Demonstration", Iterable[np.ndarray]]  # and the front pictures [h, w, 3] of its frames
+DEPTH = f"{FRONT}_depth"
 
 
 class Sets:
     """Makes the training sets that are asked for, once."""
 
-    def __init__(self, store: Store, form: Form, workers: int) -> None:
-        """Nothing is made before it is asked for; `workers` are those of the product's command."""
-        self.store, self.form, self.workers = store, form, workers
+    def __init__(self, store: Store, form: Form, workers: int, depth_network: Path | None = None) -> None:
+        """Nothing is made before it is asked for.
+
+        `workers` are those of the product's command, `depth_network` is a file of ONNX for rows with one.
+        """
+        self.store, self.form, self.workers, self.depth_network = store, form, workers, depth_network
         self._scene: Scene | None = None
 
     @property
@@ -71,8 +76,9 @@ class Sets:
         """The dataset that a row trains on."""
         return self.store.made(f"sets/{row.dataset}", lambda path: row.make(self, path))
 
-    def write(self, root: Path, episodes: Iterable[Episode], *, wrist: bool = False) -> None:
-        """Records episodes through LeRobot's own API."""
+    def write(self, root: Path, episodes: Iterable[Episode], *, wrist: bool = False, depth: bool = False) -> None:
+        """Records episodes through LeRobot's own API; `depth` is that of the pictures as they are rendered."""
+        from lerobot.configs import DepthEncoderConfig
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
         from lerobot_msdyn.dataset.video import tamed_av1
@@ -85,15 +91,26 @@ class Sets:
             "names": ["height", "width", "channels"],
         }
         vector = {"dtype": "float32", "shape": (len(JOINTS),), "names": [f"{name}.pos" for name in JOINTS]}
-        features = {"observation.state": vector, "action": dict(vector), FRONT: picture}
+        features: dict[str, Any] = {"observation.state": vector, "action": dict(vector), FRONT: picture}
         if wrist:
             features[WRIST] = dict(picture)
+        if depth:
+            size = (self.form.height, self.form.width, 1)
+            features[DEPTH] = picture | {"shape": size, "info": {"is_depth_map": True}}
         dataset = LeRobotDataset.create(
-            "local/policy", FPS, features, root=root, robot_type="so101_follower", video_backend="pyav"
+            "local/policy",
+            FPS,
+            features,
+            root=root,
+            robot_type="so101_follower",
+            video_backend="pyav",
+            depth_encoder=DepthEncoderConfig(extra_options={"x265-params": "lossless=1:log-level=error"}),
         )
         for demonstration, pictures in episodes:
             for t, front in enumerate(pictures):
                 row = {"observation.state": demonstration.state[t], "action": demonstration.action[t], "task": TASK}
+                if depth:
+                    row[DEPTH] = self.scene.depth_mm()
                 if wrist:
                     row[WRIST] = self.scene.pictures(demonstration.qpos[t], wrist=True)[0]
                 dataset.add_frame(row | {FRONT: front})
@@ -118,10 +135,10 @@ class Sets:
         return [random_placement(rng, *bounds).world_from_camera() for _ in range(count)]
 
 
-def recorded(sets: Sets, path: Path) -> None:
+def recorded(sets: Sets, path: Path, *, depth: bool = False) -> None:
     """The demonstrations as they are recorded; only here, where the product copies it, is the wrist camera."""
     pose = Placement().world_from_camera()
-    sets.write(path, ((one, sets.rendered(one, pose)) for one in sets.demonstrations()), wrist=True)
+    sets.write(path, ((one, sets.rendered(one, pose)) for one in sets.demonstrations()), wrist=True, depth=depth)
 
 
 def oracle(sets: Sets, path: Path) -> None:
@@ -184,13 +201,27 @@ def front_pictures(dataset: "LeRobotDataset", episode: int) -> list[np.ndarray]:
 
 
 def product(
-    sets: Sets, path: Path, flags: tuple[str, ...] = (WITHOUT_JOINTS,), *, wide: bool = False, scenes_of: str = ""
+    sets: Sets,
+    path: Path,
+    flags: tuple[str, ...] = (WITHOUT_JOINTS,),
+    *,
+    wide: bool = False,
+    scenes_of: str = "",
+    of: str = RECORDED,
+    network: bool = False,
 ) -> None:
     """What the package's command makes of the recording, with its defaults but for the given flags.
 
-    `wide`: from poses of the oracle's range. `scenes_of`: a row whose scenes are rendered; else they are fitted.
+    Args:
+        sets: all of them.
+        path: where it goes.
+        flags: of the command.
+        wide: from poses of the oracle's range.
+        scenes_of: a row whose scenes are rendered; else they are fitted.
+        of: the row that is the recording.
+        network: whether depth is the network's.
     """
-    source = sets.folder(ROWS[RECORDED])
+    source = sets.folder(ROWS[of])
     given = [f"--root={source}", f"--new_root={path}", "--new_repo_id=local/policy_msdyn", "--repo=local/policy"]
     given += [f"--variants={sets.form.variants}", f"--workers={sets.workers}"]
     if wide:
@@ -201,6 +232,8 @@ def product(
         ]
     if scenes_of:
         given += [f"--scenes={sets.folder(ROWS[scenes_of])}"]
+    if network:
+        given += [f"--priors.depth=onnx:{sets.depth_network}"]
     command = [sys.executable, "-m", "lerobot_msdyn.augment", *given]
     environment = os.environ | {"LEROBOT_MSDYN_CACHE": str(sets.store.root / "priors"), "HF_HUB_OFFLINE": "1"}
     log = sets.store.root / "augment.log"
@@ -232,6 +265,7 @@ class Row:
     transforms: bool = True  # LeRobot's image transforms
     variants: int | None = None  # new episodes per recorded one that are used; None: all
     source: bool = True  # whether the recorded episodes are used
+    network: bool = False  # whether it needs a depth network
 
     def keeps(self, variant: int) -> bool:
         """Whether an episode is used, by its number among those of one recording; -1 is the recording."""
@@ -240,6 +274,7 @@ class Row:
 
 ROWS: dict[str, Row] = {
     RECORDED: Row(RECORDED, recorded, transforms=False),
+    WITH_DEPTH: Row("recorded_depth", partial(recorded, depth=True), transforms=False),
     "transforms": Row(RECORDED, recorded),
     "oracle": Row("oracle", oracle),
     "homography": Row("homography", homography),
@@ -248,6 +283,10 @@ ROWS: dict[str, Row] = {
     f"{FITTED}, the oracle's range": Row(
         "product_joints_wide", partial(product, flags=(), wide=True, scenes_of=FITTED)
     ),
+    f"{FITTED} and a depth network": Row(
+        "product_network", partial(product, flags=WITH_JOINTS, network=True), network=True
+    ),
+    f"{FITTED} and recorded depth": Row("product_depth", partial(product, flags=WITH_JOINTS, of=WITH_DEPTH)),
     "oracle at the product's poses": Row("oracle_product", partial(oracle_at_poses_of, "product")),
 }
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from lerobot.datasets import LeRobotDatasetMetadata
 
 from lerobot_msdyn.augment.config import AugmentConfig
-from lerobot_msdyn.core.config import PriorsConfig
+from lerobot_msdyn.core.config import FIXED, PriorsConfig
 from lerobot_msdyn.core.errors import ConfigError, PriorError
 from lerobot_msdyn.core.fields import AUTO
 from lerobot_msdyn.dataset.read import depth_key_of
@@ -20,7 +20,7 @@ LIBRARY, EXTRA = "transformers", "priors"  # that runs the models, and how it is
 
 
 def say_assumed_depth(source: LeRobotDatasetMetadata, cameras: Sequence[str], config: AugmentConfig) -> None:
-    """Warn once per run where depth is that of a table plane, or fetch the better model where that is asked for.
+    """Warn once per run where depth is assumed or rough, or fetch the better model where that is asked for.
 
     Raises:
         PriorError: it is asked for and cannot be had.
@@ -43,7 +43,9 @@ def say_assumed_depth(source: LeRobotDatasetMetadata, cameras: Sequence[str], co
             raise PriorError(f"{error}; without --fetch_models true depth is that of an assumed table plane") from error
         return
     assumed = "the table that the robot stands on"
-    if config.camera.calibration is None:
+    if config.allow_moving and (config.camera.pose_columns or config.camera.poses not in (AUTO, FIXED)):
+        assumed = "what the camera's own way tells, which is smooth between corners"
+    elif config.camera.calibration is None:
         camera = config.camera
         assumed = (
             f"a table plane seen from {camera.height_m:g} m at {camera.tilt_deg:g} degrees (--camera.height_m, "

@@ -18,6 +18,7 @@ from lerobot_msdyn.augment.recorded import read_recorded
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import EpisodeError, PriorError
 from lerobot_msdyn.core.observations import View
+from lerobot_msdyn.dataset.select import colour_cameras
 from lerobot_msdyn.reconstruction.pooled_background import MAX_EPISODES, SharedBackground, few
 from lerobot_msdyn.reconstruction.share_background import moving_in_few, share_backgrounds, shown_by
 from lerobot_msdyn.reconstruction.shown_elsewhere import Shown
@@ -67,10 +68,11 @@ def seen_together(
 
     Arguments as for `shared_backgrounds`.
     """
-    if not recipe.camera.known_before:
+    known = [key for key in cameras if recipe.camera.known_before(key)]
+    if not known:
         return shared_backgrounds(source, cameras, recipe, run, say)
-    shown = _shown_backgrounds(source, cameras, recipe, run, say)
-    others = [key for key in cameras if not shown[key]]
+    shown = _shown_backgrounds(source, known, recipe, run, say)
+    others = [key for key in cameras if not shown.get(key)]
     shared = shared_backgrounds(source, others, recipe, run, lambda what, _: say(what, 0.0)) if others else {}
     return {**shared, **{key: found for key, found in shown.items() if found}}
 
@@ -173,7 +175,12 @@ def background_episodes(source: LeRobotDatasetMetadata, recipe: Recipe) -> list[
 
 def background_worth(source: LeRobotDatasetMetadata, recipe: Recipe) -> float:
     """As many episodes as what `seen_together` takes as long as, about."""
-    return (WORTH_SHOWN if recipe.camera.known_before else WORTH) * len(background_episodes(source, recipe))
+    return (WORTH_SHOWN if any_known_before(source, recipe) else WORTH) * len(background_episodes(source, recipe))
+
+
+def any_known_before(source: LeRobotDatasetMetadata, recipe: Recipe) -> bool:
+    """Whether poses of any camera are known without its videos."""
+    return any(recipe.camera.known_before(key) for key in colour_cameras(source))
 
 
 def looked_at(episodes: int) -> list[int]:

@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
 
-from lerobot_msdyn.augment.backgrounds import background_episodes
+from lerobot_msdyn.augment.backgrounds import any_known_before, background_episodes
 from lerobot_msdyn.augment.earlier_scenes import earlier_scene
 from lerobot_msdyn.augment.episode import by_feature
 from lerobot_msdyn.augment.recorded import read_recorded
@@ -241,7 +241,7 @@ def predicted_background_seconds(
     if not indices:
         return 0.0
     per_frame = source.total_frames / source.total_episodes
-    if recipe.camera.known_before:  # each shows what it has; a camera that stands still is taken for one that moves
+    if any_known_before(source, recipe):  # each shows what it has; cameras that stand still are taken for moving ones
         return len(indices) * (speeds.read_s + speeds.prepare_s) / workers * per_frame
     apart = len(set(indices) - set(episodes))  # the masks of the others serve for their own fit as well
     masks_s = (len(indices) * speeds.read_s + apart * MASKS_SHARE * speeds.prepare_s) / workers
@@ -253,7 +253,7 @@ def predicted_episode_seconds(
     speeds: Speeds, source: LeRobotDatasetMetadata, episodes: list[int], recipe: Recipe, workers: int = 1
 ) -> float:
     """The part of it for episodes, some of a run's."""
-    fitted_before = background_episodes(source, recipe) and not recipe.camera.known_before
+    fitted_before = background_episodes(source, recipe) and not any_known_before(source, recipe)
     steps = recipe.fit.steps * (FURTHER_STEPS if fitted_before else 1.0)
     busy_s = [0.0] * workers
     for index in episodes:

@@ -19,6 +19,7 @@ from lerobot_msdyn.core.config import GateConfig, Recipe
 from lerobot_msdyn.core.errors import ConfigError, EpisodeError
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.dataset.calibration import read_calibration
+from lerobot_msdyn.dataset.pose_columns import ORIGIN, new_poses
 from lerobot_msdyn.dataset.provenance import SOURCE_VARIANT, Provenance, camera_pose
 from lerobot_msdyn.dataset.read import depth_key_of, read_colour
 from lerobot_msdyn.dataset.rows import read_rows
@@ -63,7 +64,7 @@ def augment_episode(
     What an earlier run has finished of it is taken from the output's work folder.
 
     Raises:
-        EpisodeError: the episode cannot be read.
+        EpisodeError: the episode cannot be read or reconstructed.
         PriorError: a prior was demanded and cannot be had.
     """
     episode, defects = read_recorded(source, index, cameras, recipe)
@@ -93,12 +94,15 @@ def augment_episode(
             key=key,
             steps=steps_with_sheet(sheets[key], key, source.fps),
         )
-        scenes[key] = kept.keep(f"{SCENE}_{key}", make_scene)
+        try:
+            scenes[key] = kept.keep(f"{SCENE}_{key}", make_scene)
+        except EpisodeError as error:
+            raise EpisodeError(f"{source.repo_id} episode {index}, {key}: {error}") from error
     ready = {key: on_device(scene, chosen_device(recipe.device)) for key, scene in scenes.items()}
     priors = {key: scene.provenance for key, scene in scenes.items()}
     new = []
     if recipe.include_source:
-        known = {key: scene.camera for key, scene in scenes.items() if scene.camera.origin == "calibration"}
+        known = {key: scene.camera for key, scene in scenes.items() if scene.camera.world}
         poses = {key: camera_pose(camera, camera) for key, camera in known.items()}
         new.append(NewEpisode(index, Provenance(source.repo_id, index, SOURCE_VARIANT, recipe.seed, {}, priors, poses)))
     for variant in range(recipe.variants if cameras else 0):
@@ -239,6 +243,8 @@ def _staged(
         pictures = {key: masks.kept(key, frames) for key, frames in pictures.items()}
     frames = by_feature(source, pictures, depth=recipe.render_depth)
     new = output.stage(index, variant, frames, provenance)
+    displaced = {key: chosen.cameras[key] for key, scene in scenes.items() if scene.camera.origin == ORIGIN}
+    new = replace(new, columns=new_poses(source, index, recipe.camera, displaced))
     return new if masks is None else replace(new, masks=masks.arrays())
 
 

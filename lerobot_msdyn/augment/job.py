@@ -24,6 +24,7 @@ from lerobot_msdyn.augment.run_identity import all_files, describe_run, recipe_t
 from lerobot_msdyn.augment.workers import terse
 from lerobot_msdyn.core.errors import DatasetError, EpisodeError
 from lerobot_msdyn.dataset.cover import covering_episodes
+from lerobot_msdyn.dataset.pose_columns import check_pose_columns
 from lerobot_msdyn.dataset.provenance import CALIBRATION, FOLDER, SOURCE_VARIANT, read_provenance
 from lerobot_msdyn.dataset.read import open_source
 from lerobot_msdyn.dataset.select import lost_episodes, select_cameras, select_episodes
@@ -50,11 +51,13 @@ def open_job(config: AugmentConfig, root: Path | None) -> Opened:
     """The source, its episodes, and those of its cameras that are re-rendered: that stand still, or may move.
 
     Raises:
+        ConfigError: `camera.pose_columns` names what the dataset does not have.
         DatasetError: there is no such dataset, episode or camera, or none that can be read.
     """
     source = open_source(config.repo_id, root, config.tolerance_s)
     episodes = select_episodes(source, config.episodes)
     cameras = select_cameras(source, config.cameras, allow_moving=config.allow_moving)
+    check_pose_columns(source, config.camera)
     with terse(config):
         if config.allow_moving:
             cameras = cameras_off_the_gripper(source, cameras, config)

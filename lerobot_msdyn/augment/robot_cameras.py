@@ -138,6 +138,7 @@ def calibrated[R: Recipe](
         ConfigError: the description that they name cannot be used.
     """
     extra = calibration_episodes(source, config)
+    cameras = [key for key in cameras if config.camera.pose_column(key) is None]
     if not cameras or not extra:
         return config
     path = folder / NAME

@@ -22,7 +22,7 @@ from lerobot_msdyn.augment.progress import EpisodeBar
 from lerobot_msdyn.augment.robot_cameras import calibrated
 from lerobot_msdyn.augment.run_identity import source_folder
 from lerobot_msdyn.augment.workers import Work, Workers, workers_for
-from lerobot_msdyn.core.config import Recipe
+from lerobot_msdyn.core.config import FIXED, Recipe
 from lerobot_msdyn.core.errors import EpisodeError, MsdynError
 from lerobot_msdyn.core.fields import AUTO
 from lerobot_msdyn.dataset.convert import named_as_given
@@ -179,7 +179,7 @@ def _say_what_is_assumed(source: LeRobotDatasetMetadata, cameras: list[str], con
         return
     for line in camera_lines(source, cameras, config):
         logger.info("%s", line)
-    if config.camera.calibration is None and config.camera.poses in (AUTO, "fixed"):
+    if config.camera.calibration is None and config.camera.poses in (AUTO, FIXED) and not config.camera.pose_columns:
         logger.warning(
             "no calibration: cameras are taken as fixed, with a horizontal field of view of %g degrees "
             "(--camera.calibration FILE, --camera.horizontal_fov_deg)",

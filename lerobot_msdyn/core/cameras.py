@@ -19,7 +19,7 @@ class CameraTrack:
     world_from_camera: Float[Tensor, "t 4 4"]  # m
     width: int
     height: int
-    origin: str = "assumed"  # or: calibration, exchange, sfm, fov_search
+    origin: str = "assumed"  # or: calibration, column, exchange, sfm, fov_search
     world: str = ""  # name of the frame of its poses, which videos with the same name share; empty: this video's own
 
     def __len__(self) -> int:

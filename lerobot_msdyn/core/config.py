@@ -30,6 +30,8 @@ from lerobot_msdyn.core.registry import Registry
 # Named: draccus finds the comment above a field only where its annotation holds no quotes.
 Device = Literal["auto", "cpu", "cuda"]
 Fill = Literal["inpaint", "nearest", "none"]
+POSE_ROTATIONS = ("matrix", "quaternion_xyzw", "quaternion_wxyz", "euler_xyz", "rotation_vector")
+FIXED = "fixed"  # provider of the camera as the dataset and its calibration have it
 _LEVELS = ["object", "primitive", "grain"]
 # Motion levels of other systems, which are not the package's own -> the plugin that registers each.
 RIVAL_LEVELS = {"flat": "benchmarks/rivals/flat.py", "field": "benchmarks/rivals/field.py"}
@@ -48,8 +50,18 @@ class CameraConfig:
     calibration: Path | None = None
     # Whether the robot's joints tell where cameras without a calibration stand, if its description is on this machine.
     by_robot: bool = True
-    # auto (the calibration, else fixed), fixed, sfm (pycolmap, for a moving camera), or an .npz file with K and w2c.
+    # auto (pose_columns, else the calibration, else fixed), fixed, sfm (pycolmap, for a moving camera), or an .npz file
+    # with K and w2c.
     poses: str = one_of(AUTO, (AUTO,), registry=CAMERAS)
+    # Columns that hold a camera's pose in every frame: {CAMERA: COLUMN}, see docs/calibration.md.
+    pose_columns: dict[str, str] = field(default_factory=dict)
+    # What they map: c2w (camera to world, which is the camera's pose) or w2c.
+    pose_maps: str = one_of("c2w", ("c2w", "w2c"))
+    # Axes of the camera in them: opencv (x right, y down, z forward) or opengl (y up, z backward; ARKit, Blender).
+    pose_axes: str = one_of("opencv", ("opencv", "opengl"))
+    # How they say a rotation: auto (told by the column's shape and names), matrix, quaternion_xyzw, quaternion_wxyz,
+    # euler_xyz (rad, about the fixed axes x, y, z in turn) or rotation_vector (rad).
+    pose_rotation: str = one_of(AUTO, (AUTO, *POSE_ROTATIONS))
     # Whether the poses of a camera that moves are refined: each frame is laid over what stands still.
     refine_poses: bool = True
     # Horizontal field of view in degrees, used where no calibration names the camera.
@@ -66,11 +78,16 @@ class CameraConfig:
         """Whether the poses are found for a whole video: it cannot be fitted part by part."""
         return _needs_whole_videos(self.poses, CAMERAS)
 
-    @property
-    def known_before(self) -> bool:
-        """Whether cameras are known without their videos: poses from files, or from a provider that says so."""
+    def known_before(self, key: str) -> bool:
+        """Whether a camera's poses are known without its video: by a column, files, or a provider that says so."""
         name = self.poses.partition(PARAMETER)[0]
+        if self.poses in (AUTO, FIXED):
+            return self.pose_column(key) is not None
         return self.poses.endswith(FILE) or (name in CAMERAS and bool(CAMERAS.get(name).known_before))
+
+    def pose_column(self, key: str) -> str | None:
+        """The column that holds the poses of the camera with this feature key; None: none does."""
+        return self.pose_columns.get(key, self.pose_columns.get(key.rsplit(".", 1)[-1]))
 
 
 @dataclass
@@ -91,8 +108,9 @@ class RobotConfig:
 class PriorsConfig:
     """What is known about a video before the fit: each by a provider (docs/priors.md), yours too (--plugins)."""
 
-    # auto (recorded, else a learned model that is on this machine, else stereo, else plane), recorded, plane,
-    # depth_anything, depth_anything_metric, onnx:FILE.onnx, stereo (two or more calibrated cameras), or an .npz file.
+    # auto (recorded, else a learned model that is on this machine, else stereo, parallax or plane), recorded, plane,
+    # depth_anything, depth_anything_metric, onnx:FILE.onnx, stereo (two or more calibrated cameras), parallax (a camera
+    # that moves, with poses), or an .npz file.
     depth: str = one_of(AUTO, (AUTO,), registry=DEPTH)
     # auto (a learned model that is on this machine, else change), change, sam2, edgetam, onnx:FOLDER, or an .npz file.
     masks: str = one_of(AUTO, (AUTO,), registry=MASKS)

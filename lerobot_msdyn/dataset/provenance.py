@@ -53,12 +53,13 @@ class Provenance:
 def camera_pose(source: CameraTrack, new: CameraTrack) -> dict[str, Any]:
     """A new camera for the record: K (px), and camera_from_source, which maps the recorded camera's axes to its (m).
 
-    Where the recorded camera is calibrated, `world_from_camera` is the new one's pose in the calibration's world.
+    Where the recorded camera stands still and its pose in a world is known, `world_from_camera` is the new one's there.
     One 3x3 and one 4x4 matrix where they are the same at every frame, else one per frame; rounded to 1e-6.
     """
     change = new.camera_from_world.double() @ source.world_from_camera.double()
     pose = {"K": _once(new.intrinsics), "camera_from_source": _once(change)}
-    return pose | ({"world_from_camera": _once(new.world_from_camera)} if source.origin == "calibration" else {})
+    placed = source.world and source.is_static
+    return pose | ({"world_from_camera": _once(new.world_from_camera)} if placed else {})
 
 
 def _once(matrices: Float[Tensor, "t n n"]) -> list[Any]:

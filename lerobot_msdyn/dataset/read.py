@@ -5,7 +5,7 @@ import logging
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,8 @@ from lerobot_msdyn.dataset.checks import IntactEpisodes, check_metadata, picture
 from lerobot_msdyn.dataset.chroma import is_subsampled, with_chroma
 from lerobot_msdyn.dataset.features import completed
 from lerobot_msdyn.dataset.named import check_named, no_dataset
-from lerobot_msdyn.dataset.rows import TIMESTAMP_TOLERANCE_S, on_grid, read_rows, source_file, task_of
+from lerobot_msdyn.dataset.pose_columns import ORIGIN, WORLD, posed_by_column
+from lerobot_msdyn.dataset.rows import TIMESTAMP_TOLERANCE_S, on_grid, read_rows, source_file, task_of, values_of
 from lerobot_msdyn.dataset.video_index import (
     VIDEO_ERRORS,
     VideoIndex,
@@ -163,6 +164,7 @@ def read_episode(
 
     Raises:
         EpisodeError: a file of the episode is absent or damaged.
+        ConfigError: `camera.pose_columns` names what the dataset does not have.
         PriorError: the calibration file cannot be used.
     """
     rows = read_rows(meta, index)
@@ -182,6 +184,9 @@ def read_episode(
                     "only depth that is aligned to the colour image can be used (--priors.depth plane goes without)"
                 )
         camera = make_camera(key, index, rgb, config)
+        poses = posed_by_column(meta, key, index, config, lambda column: values_of(rows, column, meta.features[column]))
+        if poses is not None:
+            camera = replace(camera, world_from_camera=poses, origin=ORIGIN, world=WORLD)
         robot = _robot(config, camera, state, meta.fps)
         views[key] = View(rgb, camera, depth, depth_range, robot)
     return Episode(

@@ -47,6 +47,7 @@ class NewEpisode:
     source_index: int
     provenance: Provenance
     pictures: StagedPictures = field(default_factory=StagedPictures)  # none for a copy of the source's episode
+    columns: Mapping[str, np.ndarray] = field(default_factory=dict)  # whose values are others: poses of new cameras
     masks: Mapping[str, np.ndarray] = field(default_factory=dict)  # of what was never seen, see `write_unseen`
     dropped: str = ""  # why there is no such episode in the end: the gate's reason
     # For the report: what took how long; and pictures by camera: of the priors, and a frame of what was dropped.
@@ -481,7 +482,7 @@ class _Assembly:
         return off_s
 
     def _new_rows(self, episode: NewEpisode, recorded: pa.Table, index: int, start: int) -> pa.Table:
-        """The source's rows with new indices and, for re-rendered image features, new pictures."""
+        """The source's rows with new indices and, for re-rendered features, new pictures and poses of the camera."""
         rows = on_grid(recorded, self.source.fps)
         new_columns: dict[str, Any] = {
             "episode_index": [index] * rows.num_rows,
@@ -489,6 +490,7 @@ class _Assembly:
         }
         for key, folder in episode.pictures.images.items():
             new_columns[key] = [{"bytes": path.read_bytes(), "path": path.name} for path in sorted(folder.iterdir())]
+        new_columns |= {key: values.tolist() for key, values in episode.columns.items()}
         for key, values in new_columns.items():
             position = rows.column_names.index(key)
             rows = rows.set_column(

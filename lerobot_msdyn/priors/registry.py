@@ -176,6 +176,14 @@ class DepthProvider(Provider):
             PriorError: it cannot be had of this video; `auto` goes on to the next provider.
         """
 
+    def reference(self, request: Request, instances: Masks) -> Estimate[Depth]:
+        """What other depth is aligned to (`is_reference`), which may be less than the estimate.
+
+        Raises:
+            PriorError: it cannot be had of this video.
+        """
+        return self.estimate(request, instances)
+
     @staticmethod
     def problem(value: Any, view: View) -> str:
         """Its shape, or values that are no depth, unless all is right."""

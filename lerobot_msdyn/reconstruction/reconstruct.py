@@ -174,7 +174,8 @@ def _background(draft: Draft) -> None:
     draft.view, keys = keys_and_poses(draft.view, draft.priors, refine=refine)
     elsewhere = [other for other in draft.elsewhere if other.fits(draft.view)]
     if elsewhere:
-        keys = with_shown(keys, draft.view, elsewhere, refine=refine)
+        measured = draft.priors.depth_traits.measured
+        keys = with_shown(keys, draft.view, elsewhere, refine=refine, measured=measured)
     if draft.shared is not None:
         keys = fixed_view(completed(keys[0].empty, draft.shared.empty, len(draft.view)), draft.view.camera)
     first = None if draft.before is None else draft.before.empty.result()

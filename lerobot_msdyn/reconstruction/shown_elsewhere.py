@@ -38,6 +38,13 @@ LEAST_BOTH = 0.05  # share of a picture that two episodes must both show for the
 # where an arm rests in one alone; 0.91, 0.79 and 0.66 where poses are 3, 10 and 30 mm beside (0.4, 1.4 and 4 % of the
 # distance) and are not refined; 0.20 to 0.66 where the desk is laid otherwise.
 AGREEING = 0.83
+# The same of depth that nobody measured, after what it is off by smoothly has been taken out: 0.83 to 0.89 by networks'
+# depth of the same desk, 0.67 to 0.76 where poses are 30 mm beside, 0.43 to 0.47 where the desk is laid otherwise.
+AGREEING_ROUGHLY = 0.78
+ROUGH = 0.03  # relative difference up to which such depths are of one surface
+BENT_OVER = 1 / 32  # of a picture's width, over which such depth is off alike ...
+BENT_BY = (0.1, 0.05)  # ... and by how much at most, in two rounds
+BENT_AS_USUAL = 0.02  # weight of what is usual, where little is in both
 BLUR_PX = 1.5  # of 320: colours are compared after it, since fine texture lies half a pixel beside
 ALIKE_GREY_LEVELS = 20.0  # difference up to which colours are alike, after the gain
 GREY = (16, 240)  # grey levels between which a gain is told
@@ -118,13 +125,17 @@ class _Compared:
     laid: list[_Laid]
     gain: Float32[ndarray, "3"]  # that brings its colours to this one's
     alike: list[Bool[ndarray, "h w"]]  # where both show the same surface in the same colour
+    enough: float  # share that must agree
 
     @classmethod
-    def of(cls, other: Shown, own: Sequence[Source], tolerance: float) -> "_Compared":
-        """Hold it against key views."""
+    def of(cls, other: Shown, own: Sequence[Source], tolerance: float, *, measured: bool = True) -> "_Compared":
+        """Hold it against key views; depth that nobody measured is brought to theirs first."""
+        if not measured:
+            for most in BENT_BY:
+                other = _bent(other, own, most)
         laid = [_Laid.of(source, own, tolerance) for source in other.sources]
-        gain = _gain(laid)
-        return cls(other, laid, gain, [frame.alike(gain) & frame.same for frame in laid])
+        gain, enough = _gain(laid), AGREEING if measured else AGREEING_ROUGHLY
+        return cls(other, laid, gain, [frame.alike(gain) & frame.same for frame in laid], enough)
 
     @property
     def both(self) -> int:
@@ -144,7 +155,7 @@ class _Compared:
             return False
         told = bool(((self.gain >= GAINS[0]) & (self.gain <= GAINS[1])).all())
         what = f"{100 * self.share:.1f} % of what is in both agrees, colours times {self.gain.round(2)}"
-        if not told or self.share < AGREEING:
+        if not told or self.share < self.enough:
             logger.info("background: nothing is taken of episode %d: %s", self.other.episode, what)
             return False
         logger.debug("background: episode %d: %s", self.other.episode, what)
@@ -164,7 +175,7 @@ class _Compared:
 
 
 def with_shown(
-    keys: Sequence[KeyView], view: View, elsewhere: Sequence[Shown], *, refine: bool = True
+    keys: Sequence[KeyView], view: View, elsewhere: Sequence[Shown], *, refine: bool = True, measured: bool = True
 ) -> tuple[KeyView, ...]:
     """An episode's key views, with what others show of surfaces that it does not show.
 
@@ -173,16 +184,17 @@ def with_shown(
         view: its video.
         elsewhere: what others show, with poses in the same world.
         refine: whether others are laid over this one, so that a small error of their poses goes.
+        measured: whether depth is (`DepthTraits.measured`); a network's is off by something else in every video.
     """
     own = [key.source for key in keys]
     difference = usual_difference(own)
-    tolerance = tolerance_of(difference)
+    tolerance = tolerance_of(difference) if measured else max(tolerance_of(difference), ROUGH)
     near = _reaching(keys, view.camera)
     taken: list[Source] = []
     for other in elsewhere:
-        compared = _Compared.of(other, own, tolerance)
+        compared = _Compared.of(other, own, tolerance, measured=measured)
         if refine:
-            moved = _Compared.of(_moved(compared, keys), own, tolerance)
+            moved = _Compared.of(_moved(compared, keys), own, tolerance, measured=measured)
             compared = max(compared, moved, key=lambda one: one.share)
         if compared.accepted:
             taken += compared.taken(near)
@@ -211,6 +223,27 @@ def _moved(compared: "_Compared", keys: Sequence[KeyView]) -> Shown:
     given = other.camera.world_from_camera.double()
     by = camera.world_from_camera[0].double() @ invert_se3(given[most])
     return replace(other, camera=replace(other.camera, world_from_camera=(by @ given).float()))
+
+
+def _bent(other: Shown, own: Sequence[Source], most: float) -> Shown:
+    """Another episode with its depth times a factor that varies smoothly, by which this one's key views differ from it.
+
+    Where they differ by more than `most` (relative), they show something else.
+    """
+    depth = []
+    for source in other.sources:
+        mine = fused(source, own, most, exact=False).depth.numpy()
+        theirs = source.depth.numpy()
+        both = (mine > 0) & (theirs > 0)
+        factor = np.log(np.where(both, mine, 1.0) / np.where(both, theirs, 1.0)).astype(np.float32)
+        both &= np.abs(factor) < most
+        weight = both.astype(np.float32)
+        usual = float(np.median(factor[both])) if both.any() else 0.0
+        sigma = BENT_OVER * weight.shape[1]
+        total = cv2.GaussianBlur(factor * weight, (0, 0), sigma) + BENT_AS_USUAL * usual
+        smooth = total / (cv2.GaussianBlur(weight, (0, 0), sigma) + BENT_AS_USUAL)
+        depth.append(torch.from_numpy(theirs * np.exp(smooth)))
+    return replace(other, depth=torch.stack(depth))
 
 
 def _reaching(keys: Sequence[KeyView], camera: CameraTrack) -> list[CameraTrack]:

@@ -93,6 +93,7 @@ def save(scene: SavedScene, root: Path, beside: Mapping[str, object] | None = No
         "width": scene.camera.width,
         "height": scene.camera.height,
         "camera_origin": scene.camera.origin,
+        "camera_world": scene.camera.world,
         "metric": scene.metric,
         "distance_m": scene.distance,
         "up": list(scene.up),
@@ -127,6 +128,7 @@ def load(folder: Path) -> SavedScene:
             header["width"],
             header["height"],
             header["camera_origin"],
+            header.get("camera_world", "calibration" if header["camera_origin"] == "calibration" else ""),
         )
         return SavedScene(
             source=SceneSource(**header["source"]),

@@ -20,8 +20,9 @@ class MixedViews(torch.utils.data.Dataset):
     """Wraps a LeRobotDataset; with some probability a sample's pictures are rendered from the episode's saved scene.
 
     One new pose per camera holds for the whole observation window; cameras without a scene, states, actions and all
-    else are as recorded. What a sample is depends on (seed, epoch, index) alone, not on workers or order. Everything
-    that this class does not define (`meta`, `episodes`, `num_frames`, ...) is the wrapped dataset's.
+    else are as recorded, also columns that say where the camera was. What a sample is depends on (seed, epoch, index)
+    alone, not on workers or order. Everything that this class does not define (`meta`, `episodes`, `num_frames`, ...)
+    is the wrapped dataset's.
     """
 
     def __init__(

@@ -130,10 +130,11 @@ def _checked(perturbation: Perturbation, amounts: ndarray, frames: int) -> Float
 
 
 def share_a_world(views: Mapping[str, Viewpoint]) -> bool:
-    """Whether the cameras' poses are known in one frame: all calibrated, at different places."""
+    """Whether the cameras' poses are known in one frame, at different places."""
     cameras = [view.camera for view in views.values()]
     places = {tuple(camera.world_from_camera[0].flatten().tolist()) for camera in cameras}
-    return all(camera.origin == "calibration" for camera in cameras) and len(places) == len(cameras) > 1
+    worlds = {camera.world for camera in cameras}
+    return len(worlds) == 1 and "" not in worlds and len(places) == len(cameras) > 1
 
 
 def _zoomed(camera: CameraTrack, amounts: Float[Tensor, "s n"]) -> CameraTrack:

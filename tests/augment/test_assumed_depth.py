@@ -61,6 +61,13 @@ def test_of_a_calibrated_robot_the_table_is_named(fetched, caplog) -> None:
     assert "several calibrated cameras" in said(caplog, config, ("front", "side"))[0]
 
 
+def test_before_a_camera_that_moves_its_way_is_named(fetched, caplog) -> None:
+    for camera in (CameraConfig(poses="sfm"), CameraConfig(pose_columns={"front": "observation.pose"})):
+        [line] = said(caplog, AugmentConfig(camera=camera, allow_moving=True))
+        assert line.startswith("no recorded depth: scenes are built on what the camera's own way tells, ")
+        caplog.clear()
+
+
 def test_the_model_is_fetched_where_that_is_asked_for(fetched, caplog) -> None:
     assert said(caplog, AugmentConfig(fetch_models=True)) == [
         f"depth by {METRIC}: depth_anything_metric",

@@ -6,7 +6,7 @@ import pytest
 import torch
 from walking import walk
 
-from lerobot_msdyn.core.errors import PriorError
+from lerobot_msdyn.core.errors import EpisodeError
 from lerobot_msdyn.core.observations import DepthTraits
 from lerobot_msdyn.priors.camera.scale import scaled_to_depth
 from lerobot_msdyn.priors.registry import Depth
@@ -25,5 +25,5 @@ def test_shifts_of_another_unit_become_those_of_the_depth() -> None:
 def test_without_depth_nothing_tells() -> None:
     _, view, priors = walk()
     nothing = Depth(torch.zeros_like(priors.depth), DepthTraits())
-    with pytest.raises(PriorError, match="cannot be told from depth"):
+    with pytest.raises(EpisodeError, match="cannot be told from depth"):
         scaled_to_depth(view.camera, view.rgb, nothing, priors.instances)

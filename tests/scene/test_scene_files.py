@@ -176,11 +176,12 @@ def test_a_folder_of_an_earlier_version_is_read(tmp_path: Path) -> None:
     scene = load(list_scenes(tmp_path)[3]["observation.images.front"])
     assert (scene.source.fps, scene.starts, scene.metric, scene.distance) == (30, (0, 2), True, 0.75)
     assert (len(scene), scene.camera.width, scene.camera.origin) == (4, 64, "calibration")
+    assert scene.camera.world == "calibration"
     assert torch.equal(scene.camera.intrinsics, camera["intrinsics"])
     again = save(scene, tmp_path / "again")
     for file in sorted(folder.iterdir()):
         written = (again / file.name).read_bytes()
-        made = header | {"up": [0.0, -1.0, 0.0]}
+        made = header | {"camera_world": "calibration", "up": [0.0, -1.0, 0.0]}
         same = json.loads(written) == made if file.suffix == ".json" else written == file.read_bytes()
         assert same, file.name
 

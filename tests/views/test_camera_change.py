@@ -31,11 +31,11 @@ SAMPLED = (Orbit, Translation, Rotation, Dolly, Focal, Jitter, Drift)
 
 
 def scene(
-    pose: torch.Tensor | None = None, *, metric: bool = True, origin: str = "assumed", frames: int = FRAMES
+    pose: torch.Tensor | None = None, *, metric: bool = True, world: str = "", frames: int = FRAMES
 ) -> SavedScene:
     """A scene of nothing, with a camera that stands still."""
     camera = static_camera(intrinsics_from_fov(64, 48, 60.0), frames, 64, 48, pose)
-    camera = dataclasses.replace(camera, origin=origin)
+    camera = dataclasses.replace(camera, world=world)
     return SavedScene(SceneSource("local/none", 0, "a", 30), (), (), camera, metric, DISTANCE, {})
 
 
@@ -133,7 +133,7 @@ def test_a_given_pose_is_reached_and_half_of_it_is_half_way() -> None:
 
 def test_another_cameras_pose() -> None:
     other = orbit_offset(25.0, -5.0, DISTANCE)
-    front = scene(orbit_offset(-10.0, 0.0, DISTANCE), origin="calibration")
+    front = scene(orbit_offset(-10.0, 0.0, DISTANCE), world="calibration")
     found = sample_change(OtherCamera(camera="side"), {"a": front}, 0, 0, 0, other=other).cameras()["a"]
     torch.testing.assert_close(found.world_from_camera[2], other, atol=1e-5, rtol=0)
     with pytest.raises(ConfigError, match="'other_camera' needs the pose of camera 'side', which is not kept"):
@@ -153,8 +153,8 @@ def test_a_longer_focal_length_keeps_the_principal_point() -> None:
 @pytest.mark.parametrize(("kind", "moves_rig"), [(Orbit, True), (Translation, True), (Drift, True), (Jitter, False)])
 def test_calibrated_cameras_move_as_one_body_others_each_by_itself(kind: type[Perturbation], moves_rig: bool) -> None:
     poses = [orbit_offset(0.0, 0.0, DISTANCE), orbit_offset(40.0, 10.0, DISTANCE)]
-    for origin, rigid in (("calibration", moves_rig), ("assumed", False)):
-        scenes = {str(i): scene(pose, origin=origin) for i, pose in enumerate(poses)}
+    for world, rigid in (("calibration", moves_rig), ("", False)):
+        scenes = {str(i): scene(pose, world=world) for i, pose in enumerate(poses)}
         both = sample_change(kind(), scenes, 0, 1, 0)
         cameras = both.cameras()
         a, b = (cameras[key].world_from_camera[-1] for key in "01")

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.corners import away_from, corners_followed
-from lerobot_msdyn.core.errors import PriorError
+from lerobot_msdyn.core.errors import EpisodeError
 from lerobot_msdyn.priors.registry import Depth
 
 _PAIRS = 40  # pairs of frames that are looked at
@@ -27,7 +27,7 @@ def scaled_to_depth(
     A corner with its depth is at X in one frame; in another the ray through it holds R X + s t, which gives s.
 
     Raises:
-        PriorError: too few corners of known depth can be followed, or the camera only turns.
+        EpisodeError: too few corners of known depth can be followed, or the camera only turns.
     """
     frames, gaps = len(camera), [max(1, round(share * len(camera))) for share in _APART]
     told: list[Float64[ndarray, "n 2"]] = []  # of each corner s, and how far it goes by a shift
@@ -38,7 +38,7 @@ def scaled_to_depth(
     chosen = sure >= np.quantile(sure, 1 - _SURE) if len(sure) else np.zeros(0, bool)
     factor = float(np.median(factors[chosen])) if chosen.sum() >= _LEAST else 0.0
     if not factor > 0:
-        raise PriorError(
+        raise EpisodeError(
             f"the unit of the camera's poses cannot be told from depth: {len(factors)} corners of known depth could be "
             f"followed, expected {_LEAST} or more that go by parallax; give poses in metres by --camera.poses FILE.npz"
         )

@@ -13,7 +13,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.core.errors import PriorError
+from lerobot_msdyn.core.errors import EpisodeError
 from lerobot_msdyn.core.geometry import matrix_to_quaternion, quaternion_to_matrix
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.core.sampling import evenly, scaled_px
@@ -34,7 +34,8 @@ def camera_from_sfm(view: View, instances: UInt8[Tensor, "t h w"]) -> CameraTrac
     registered ones are interpolated.
 
     Raises:
-        PriorError: pycolmap is absent, the camera does not move, or too few frames could be registered.
+        PriorError: pycolmap is absent, or the camera does not move.
+        EpisodeError: too few frames of this video could be registered.
     """
     demand_library("pycolmap", "sfm", "structure from motion")
     motion = camera_motion_px(view.rgb, instances > 0) / scaled_px(1, view.camera.width)
@@ -50,7 +51,7 @@ def camera_from_sfm(view: View, instances: UInt8[Tensor, "t h w"]) -> CameraTrac
         model = _reconstruct(folder, view.camera)
     poses, intrinsics = model if model is not None else ({}, None)
     if intrinsics is None or len(poses) < max(2, _MIN_SHARE * len(frames)):
-        raise PriorError(
+        raise EpisodeError(
             f"structure from motion registered {len(poses)} of {len(frames)} frames; expected half of them or more: "
             "too little texture or parallax; give the poses by --camera.poses FILE.npz"
         )

@@ -72,7 +72,7 @@ def reference_depth(request: Request, instances: Masks) -> tuple[Depth, Origin]:
     return best(
         DepthProvider,
         request,
-        lambda provider: provider.estimate(request, instances),
+        lambda provider: provider.reference(request, instances),
         among=lambda provider: provider.is_reference,
     )
 

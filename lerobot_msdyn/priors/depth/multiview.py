@@ -61,7 +61,7 @@ def why_no_partner(view: View, others: Sequence[View]) -> str:
 
 
 def _is_calibrated(camera: CameraTrack) -> bool:
-    return camera.origin in ("calibration", "exchange") and camera.is_static
+    return camera.origin in ("calibration", "column", "exchange") and camera.is_static
 
 
 def _angle_deg(camera: CameraTrack, other: CameraTrack) -> float:

@@ -44,19 +44,19 @@ def ground_plane(camera: CameraTrack, ground_m: float) -> Ground:
     return torch.where(descent > above / wall, above / descent.clamp(min=1e-6), wall)
 
 
-def with_standing(ground: Ground, instances: UInt8[Tensor, "t h w"]) -> Float[Tensor, "t h w"]:
-    """z-depth (m) of the ground, and of upright things on it.
+def with_standing(ground: Ground | Float[Tensor, "t h w"], instances: UInt8[Tensor, "t h w"]) -> Float[Tensor, "t h w"]:
+    """z-depth (m) of the ground, which may be another at every frame, and of upright things on it.
 
     A moving instance has one depth per frame, that of the ground under its lowest rows, smoothed over time. Plausible,
     not metric: what is lifted, or hides its own foot, is put too far away or too near.
     """
-    depth, rows = ground.repeat(len(instances), 1, 1), ground.median(dim=1).values
+    depth, rows = ground.expand(instances.shape), ground.median(dim=-1).values.expand(instances.shape[:2])
     for instance in range(1, int(instances.max()) + 1):
         mask = instances == instance
         if bool(mask.any()):
             whole = mask | (without_holes(mask) & (instances == 0))  # masks miss spots that look like the table
             depth = torch.where(whole, _standing(mask, rows)[:, None, None], depth)
-    return depth
+    return depth.contiguous()
 
 
 def without_holes(mask: Bool[Tensor, "t h w"]) -> Bool[Tensor, "t h w"]:
@@ -68,12 +68,12 @@ def without_holes(mask: Bool[Tensor, "t h w"]) -> Bool[Tensor, "t h w"]:
     return torch.from_numpy(whole).bool()
 
 
-def _standing(mask: Bool[Tensor, "t h w"], rows: Float[Tensor, " h"]) -> Float[Tensor, " t"]:
+def _standing(mask: Bool[Tensor, "t h w"], rows: Float[Tensor, "t h"]) -> Float[Tensor, " t"]:
     """Depth (m) of an instance at every frame, from the row where it touches the table."""
     down_to_row = mask.sum(2).cumsum(1) / mask.sum((1, 2)).clamp(min=1)[:, None]
-    foot = (down_to_row < _LOWEST).sum(1).clamp(max=len(rows) - 1)
+    foot = (down_to_row < _LOWEST).sum(1).clamp(max=rows.shape[1] - 1)
     seen = mask.any(2).any(1).nonzero()[:, 0].numpy()
-    nearest = np.interp(np.arange(len(mask)), seen, rows[foot[seen]].numpy()).astype(np.float32)
+    nearest = np.interp(np.arange(len(mask)), seen, rows[seen, foot[seen]].numpy()).astype(np.float32)
     reach = _SMOOTH_FRAMES // 2
     padded = torch.from_numpy(np.pad(nearest, 2 * reach, mode="edge"))
     median = padded.unfold(0, _SMOOTH_FRAMES, 1).median(dim=-1).values

@@ -48,7 +48,7 @@ def matched_points(features: Features, others: Features, camera: CameraTrack, ot
     if min(len(features.xy), len(others.xy)) < 2:
         return np.zeros((0, 3), np.float32)
     pairs = np.array(_mutual(features.descriptors, others.descriptors), int).reshape(-1, 2)
-    return _triangulated(features.xy[pairs[:, 0]], others.xy[pairs[:, 1]], camera, other)
+    return triangulated(features.xy[pairs[:, 0]], others.xy[pairs[:, 1]], camera, other)
 
 
 def confirmed(points: list[Points]) -> Points:
@@ -91,10 +91,13 @@ def _mutual(a: Float32[ndarray, "n d"], b: Float32[ndarray, "m d"]) -> list[tupl
     return [(m.queryIdx, m.trainIdx) for m in there if back[m.trainIdx] == m.queryIdx]
 
 
-def _triangulated(
+def triangulated(
     a: Float[ndarray, "n 2"], b: Float[ndarray, "n 2"], camera: CameraTrack, other: CameraTrack
 ) -> Float32[ndarray, "m 3"]:
-    """Pairs of pixels as points of the first camera, without those that do not fit the calibration."""
+    """Pairs of pixels as x, y (px) and z-depth (m) in the first camera, without those that do not fit the two's poses.
+
+    Of either camera the first frame counts.
+    """
     pose = relative_pose(camera, other)
     k_a, k_b = (c.intrinsics[0].double().numpy() for c in (camera, other))
     project_a, project_b = k_a @ np.eye(3, 4), k_b @ pose[:3]
@@ -102,12 +105,14 @@ def _triangulated(
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ pose[:3, :3]
     fundamental = np.linalg.inv(k_b).T @ essential @ np.linalg.inv(k_a)
     lines = np.c_[a, np.ones(len(a))] @ fundamental.T
-    off = np.abs((np.c_[b, np.ones(len(b))] * lines).sum(1)) / np.linalg.norm(lines[:, :2], axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):  # cameras in one place
+        off = np.abs((np.c_[b, np.ones(len(b))] * lines).sum(1)) / np.linalg.norm(lines[:, :2], axis=1)
     a, b = a[off < _EPIPOLAR_PX], b[off < _EPIPOLAR_PX]
     if len(a) == 0:
         return np.zeros((0, 3), np.float32)
     points = cv2.triangulatePoints(project_a, project_b, a.T, b.T)
-    points = (points[:3] / points[3]).T
+    with np.errstate(divide="ignore", invalid="ignore"):  # rays that do not meet
+        points = (points[:3] / points[3]).T
     there = points @ pose[:3, :3].T + pose[:3, 3]
     centre = -pose[:3, :3].T @ pose[:3, 3]
     towards = points - centre

@@ -3,6 +3,7 @@
 import logging
 
 from lerobot_msdyn.core.cameras import CameraTrack
+from lerobot_msdyn.core.config import FIXED
 from lerobot_msdyn.core.fields import AUTO
 from lerobot_msdyn.core.sampling import scaled_px
 from lerobot_msdyn.priors.camera.steadiness import FIXED_PX, SWAY_PX, camera_motion_px
@@ -12,9 +13,9 @@ from lerobot_msdyn.priors.request import Request
 logger = logging.getLogger(__name__)
 
 
-@CAMERAS.register("fixed")
+@CAMERAS.register(FIXED)
 class Fixed(CameraProvider):
-    """The camera as the calibration has it, else as it is assumed; can always be used."""
+    """The camera as a pose column or the calibration has it, else as it is assumed; can always be used."""
 
     rank = 10
 
