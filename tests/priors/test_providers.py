@@ -14,8 +14,11 @@ from lerobot_msdyn.core.cameras import intrinsics_from_fov, static_camera
 from lerobot_msdyn.core.config import CameraConfig, PriorsConfig
 from lerobot_msdyn.core.errors import PriorError
 from lerobot_msdyn.core.observations import BodyTracks, RobotSeen, View
-from lerobot_msdyn.priors import Priors, estimate_priors
+from lerobot_msdyn.priors import Priors, estimate_masks, estimate_priors
+from lerobot_msdyn.priors.camera.steadiness import camera_motion_px
 from lerobot_msdyn.priors.depth.table_plane import ground_plane
+from lerobot_msdyn.synthetic import make_scene
+from lerobot_msdyn.synthetic.viewpoints import hand_held_camera
 
 FRAMES = 12
 
@@ -210,3 +213,17 @@ def test_learned_models_are_used_where_they_are_and_recorded(view: View, tmp_pat
 def test_the_field_of_view_is_not_searched_on_a_plane(view: View) -> None:
     with pytest.raises(PriorError, match="needs depth that does not depend on the field of view"):
         estimate(view, CameraConfig(fov_search=True), depth="plane")
+
+
+def test_before_a_camera_that_is_said_to_move_a_slow_way_is_no_sway() -> None:
+    width, height, frames = 160, 120, 24
+    camera = hand_held_camera(frames, width, height, 10.0)
+    seen = make_scene("push", 0, frames, width, height).render(camera)
+    assert 0.5 < camera_motion_px(seen.rgb) < 3
+    fixed = View(seen.rgb, static_camera(camera.intrinsics[0], frames, width, height), seen.depth)
+    moves = replace(fixed, camera=camera)
+    masked = []
+    for view, poses in ((fixed, "auto"), (fixed, "sfm"), (moves, "auto")):
+        masks = estimate_masks(view, PriorsConfig(masks="change", cache="off"), CameraConfig(poses=poses)) > 0
+        masked.append(float((masks & (seen.instances == 0)).float().mean()))
+    assert masked[1] == masked[2] < 0.5 * masked[0]

@@ -71,13 +71,15 @@ def moving_instances(
     median: UInt8[Tensor, "h w 3"],
     noise: Float32[Tensor, "h w"],
     others: UInt8[Tensor, "m h w 3"] | None = None,
+    sway_px: float = SWAY_PX,
 ) -> UInt8[Tensor, "t h w"]:
     """Instance of every pixel: 0 = static, 1, 2, ... = things that move at some time of the clip, largest first.
 
     At most 8 instances, each followed by optical flow so that it keeps its number when it touches another. `median`
     and `noise` are those of `temporal_median`; `others` are frames of other episodes of the same fixed camera, which
-    show places that this one hides. Before a camera that moves more than it sways (`camera_motion`), what differs from
-    the background of the neighbouring frames moves (`wandering`). Videos wider than 320 px are looked at in that width.
+    show places that this one hides. Before a camera that moves by more than `sway_px` (`camera_motion_px`) what differs
+    from the background of the neighbouring frames moves (`wandering`). Videos wider than 320 px are looked at in that
+    width.
     """
     height, width = noise.shape
     size = (min(width, _MAX_WIDTH), max(1, round(height * min(1.0, _MAX_WIDTH / width))))
@@ -90,7 +92,7 @@ def moving_instances(
         small(median[None].cpu().numpy()),
         small(noise[None].numpy()),
     )
-    if camera_motion_px(torch.from_numpy(frames)) > SWAY_PX:
+    if camera_motion_px(torch.from_numpy(frames)) > sway_px:
         moving = np.stack([_tidy(odds > 0) for odds in residual_odds(frames)])
         return torch.from_numpy(_at_size(numbered(frames, moving), (width, height)))
     elsewhere = frames[:0] if others is None else small(_spread(others.cpu().numpy(), _MEDIAN_SAMPLES))
