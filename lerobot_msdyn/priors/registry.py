@@ -23,7 +23,8 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float32, UInt8
+from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.core import registries
@@ -57,6 +58,14 @@ class Estimate[T]:
 
 
 @dataclass(frozen=True)
+class Corners:
+    """Single points of what stands still, whose depth a camera's way tells."""
+
+    points: dict[int, Float32[ndarray, "_ 3"]]  # by frame: x, y (px), and z-depth in the unit of the poses
+    unit_m: float  # that unit
+
+
+@dataclass(frozen=True)
 class Depth:
     """Depth of every frame."""
 
@@ -65,6 +74,7 @@ class Depth:
     # m, of the ground that things stand on (and of a wall behind it), where depth is that of a ground.
     ground: Float[Tensor, "h w"] | None = None
     lying: frozenset[int] = frozenset()  # instances that lie on the ground throughout
+    corners: Corners | None = None  # where depth is known at these alone
 
 
 class Provider(ABC):

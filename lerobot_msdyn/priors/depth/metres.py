@@ -9,6 +9,7 @@ from lerobot_msdyn.priors.depth.align import align_disparity, align_scale
 from lerobot_msdyn.priors.depth.blurred_edges import sharpened
 from lerobot_msdyn.priors.depth.flying_pixels import without_flying_pixels
 from lerobot_msdyn.priors.depth.fuse import fused
+from lerobot_msdyn.priors.depth.parallax import bent_to
 from lerobot_msdyn.priors.exchange import AFFINE_DISPARITY, METRIC
 from lerobot_msdyn.priors.provide import best
 from lerobot_msdyn.priors.registry import Depth, DepthProvider, Estimate, Masks
@@ -26,7 +27,8 @@ def in_metres(
 ) -> Estimate[Depth]:
     """Depth without blurred edges: what is near a surface is put on it, and what floats becomes unknown.
 
-    Before a fixed camera, depth whose reference is a ground is put together with it (`priors.depth.fuse`).
+    Before a fixed camera, depth whose reference is a ground is put together with it (`priors.depth.fuse`); before one
+    that moves, it is bent to the corners that its way tells (`priors.depth.parallax`).
 
     Args:
         request: the video; other depth of it is the reference.
@@ -64,7 +66,12 @@ def in_metres(
         return _clean(z, true_metres, how, reference.ground)
     usable = None if reference.traits.measured else instances == 0
     align = align_disparity if kind == AFFINE_DISPARITY else align_scale
-    return _clean(align(values, reference.z, usable), true_metres, how)
+    z = align(values, reference.z, usable)
+    if reference.corners is not None:
+        unit_m, points = reference.corners.unit_m, reference.corners.points
+        bent = bent_to((z / unit_m).numpy(), points, request.view.camera, instances.numpy())
+        z = unit_m * torch.from_numpy(bent)
+    return _clean(z, true_metres, how)
 
 
 def reference_depth(request: Request, instances: Masks) -> tuple[Depth, Origin]:

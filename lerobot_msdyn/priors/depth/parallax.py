@@ -1,6 +1,6 @@
 """Depth of what stands still before a camera that moves with known poses: corners that go by, triangulated."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
@@ -18,6 +18,9 @@ _NEAR = 0.1  # of the clip, to either side: whose corners say how deep a frame i
 _NEAREST = 3  # frames with corners, at least
 _LEAST = 100  # points, together
 _SAME = 0.05  # share of the depth by which what is told by several frames may differ
+_BENT_OVER = 1 / 24  # of a picture's width: sigma over which other depth is off alike
+_BENT_BY = 0.15  # logarithm of the factor; what is off by more is another surface
+_HELD = 3.0  # points; so many that are not off hold other depth as it is
 type Frames = UInt8[ndarray, "t h w 3"]
 type Instances = UInt8[ndarray, "t h w"]
 
@@ -89,18 +92,50 @@ def spread_out(points: dict[int, Points], camera: CameraTrack) -> Float32[ndarra
 
     Smooth, with nothing of the shape between the points.
     """
+    everywhere = np.ones((camera.height, camera.width), bool)
+    return np.stack([spread(seen, everywhere) for seen in _seen(points, camera)])
+
+
+def bent_to(
+    depth: Float32[ndarray, "t h w"], points: dict[int, Points], camera: CameraTrack, instances: Instances
+) -> Float32[ndarray, "t h w"]:
+    """Depth (m) of another kind times a factor that varies smoothly, by which points of what stands still are off it.
+
+    A network's errors are of that kind: a slope, a bulge. Points that are far off are of other surfaces, and where
+    there are few, there is little change.
+    """
+    sigma = _BENT_OVER * camera.width
+    alone = 1 / (2 * np.pi * sigma**2)  # what a single point weighs after the blur, on itself
+    bent = np.zeros_like(depth)
+    for frame, seen in enumerate(_seen(points, camera)):
+        column, row = seen[:, :2].astype(int).T
+        z = depth[frame, row, column]
+        known = (z > 0) & (instances[frame, row, column] == 0)
+        off = np.log(seen[known, 2] / z[known])
+        usual = np.abs(off) < _BENT_BY
+        total, count = np.zeros((2, *depth.shape[1:]), np.float32)
+        at = row[known][usual], column[known][usual]
+        np.add.at(total, at, off[usual])
+        np.add.at(count, at, 1)
+        smooth = cv2.GaussianBlur(total, (0, 0), sigma) / (cv2.GaussianBlur(count, (0, 0), sigma) + _HELD * alone)
+        bent[frame] = depth[frame] * np.exp(smooth)
+    return bent
+
+
+def _seen(points: dict[int, Points], camera: CameraTrack) -> Iterator[Points]:
+    """At each frame, the points of those nearby: where they are seen, and how far away."""
     pose = camera.world_from_camera.double().numpy()
     K = camera.intrinsics.double().numpy()
     world = {}
     for frame, cloud in points.items():
         rays = np.c_[cloud[:, :2], np.ones(len(cloud))] @ np.linalg.inv(K[frame]).T
         world[frame] = rays * cloud[:, 2:] @ pose[frame, :3, :3].T + pose[frame, :3, 3]
-    frames, everywhere = len(camera), np.ones((camera.height, camera.width), bool)
-    depth = np.zeros((frames, *everywhere.shape), np.float32)
+    frames, size = len(camera), (camera.width, camera.height)
     for frame in range(frames):
         away = sorted((abs(other - frame), other) for other in world)
         near = [world[other] for i, (apart, other) in enumerate(away) if i < _NEAREST or apart <= _NEAR * frames]
         seen = (np.concatenate(near) - pose[frame, :3, 3]) @ pose[frame, :3, :3] @ K[frame].T
         seen = seen[seen[:, 2] > 0]
-        depth[frame] = spread(np.c_[seen[:, :2] / seen[:, 2:], seen[:, 2]].astype(np.float32), everywhere)
-    return depth
+        xy = seen[:, :2] / seen[:, 2:]
+        inside = ((xy >= 0) & (xy < size)).all(1)
+        yield np.c_[xy, seen[:, 2]][inside].astype(np.float32)

@@ -1,5 +1,7 @@
 """Depth by the camera's own way: what goes by how fast."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -12,7 +14,7 @@ from lerobot_msdyn.priors.depth.parallax import as_maps, parallax_points, spread
 from lerobot_msdyn.priors.depth.providers.plane import Plane
 from lerobot_msdyn.priors.depth.table_plane import with_standing
 from lerobot_msdyn.priors.depth.triangulate import Points
-from lerobot_msdyn.priors.registry import DEPTH, Depth, DepthProvider, Estimate, Masks, Unusable
+from lerobot_msdyn.priors.registry import DEPTH, Corners, Depth, DepthProvider, Estimate, Masks, Unusable
 from lerobot_msdyn.priors.request import Request
 
 RELATIVE_ERROR = 0.05
@@ -44,8 +46,11 @@ class Parallax(DepthProvider):
 
     def reference(self, request: Request, instances: Masks) -> Estimate[Depth]:
         """The corners alone."""
-        maps = as_maps(self._points(request, instances), *instances.shape)
-        return Estimate(self._in_unit(torch.from_numpy(maps), request, instances), "corners that go by")
+        points = self._points(request, instances)
+        maps = torch.from_numpy(as_maps(points, *instances.shape))
+        depth = self._in_unit(maps, request, instances)
+        unit = float(depth.z.sum() / maps.sum())
+        return Estimate(replace(depth, corners=Corners(points, unit)), "corners that go by")
 
     def _points(self, request: Request, instances: Masks) -> dict[int, Points]:
         camera = request.view.camera
