@@ -16,7 +16,10 @@ from lerobot_msdyn.core.errors import PriorError
 from lerobot_msdyn.core.sampling import evenly, scaled_px
 from lerobot_msdyn.priors.depth.align import MAX_FACTOR, scale_alone, scale_and_shift
 
-MOST_FRAMES = 60  # that a median is taken over
+MOST_FRAMES = 60  # that what is empty is told by
+# Quantile of inverse depth over frames that stands for what is empty: networks draw what is around a near thing towards
+# it, and never away from it.
+EMPTY = 0.25
 MARGIN_PX = 4.0  # of 320: about what moves
 SPECK_PX = 5.0  # of 320: what is smaller, and said to stand on the ground, does not
 NEAR_GROUND = (0.02, 0.09)  # share of inverse depth by which depth may be off and mean the ground, least and most
@@ -55,8 +58,8 @@ def fused(
         PriorError: the network's depth and the ground have nothing in common.
     """
     own = _still(inverse, instances)
-    still = own if elsewhere is None else _median(torch.cat((own[None], elsewhere)))
-    aligned_to = still if elsewhere is None else _median(elsewhere)  # the same for all episodes
+    still = own if elsewhere is None else _empty(torch.cat((own[None], elsewhere)))
+    aligned_to = still if elsewhere is None else _empty(elsewhere)  # the same for all episodes
     if known:
         scale, shift, near = _to_ground(aligned_to, ground, shifted)
     elif shifted:
@@ -75,18 +78,18 @@ def fused(
 
 
 def _still(inverse: Float[Tensor, "t h w"], instances: UInt8[Tensor, "t h w"]) -> Float[Tensor, "h w"]:
-    """Median over frames in which nothing moves at a pixel or near it; where there are none, over all."""
+    """Of frames in which nothing moves at a pixel or near it; where there are none, of all."""
     some = evenly(len(inverse), MOST_FRAMES)
     window = np.ones((2 * round(scaled_px(MARGIN_PX, inverse.shape[2])) + 1,) * 2, np.uint8)
     near = np.stack([cv2.dilate((mask > 0).astype(np.uint8), window) for mask in instances[some].numpy()])
     values = inverse[some]
-    still = _median(torch.where(torch.from_numpy(near > 0), torch.nan, values))
-    return torch.where(torch.isfinite(still), still, _median(values))
+    still = _empty(torch.where(torch.from_numpy(near > 0), torch.nan, values))
+    return torch.where(torch.isfinite(still), still, _empty(values))
 
 
-def _median(values: Float[Tensor, "m h w"]) -> Float[Tensor, "h w"]:
-    """Of what is finite; NaN where nothing is."""
-    return torch.where(torch.isfinite(values), values, torch.nan).nanmedian(dim=0).values
+def _empty(values: Float[Tensor, "m h w"]) -> Float[Tensor, "h w"]:
+    """What several frames say of the empty scene; NaN where none says anything."""
+    return torch.where(torch.isfinite(values), values, torch.nan).nanquantile(EMPTY, dim=0)
 
 
 def _to_ground(still: Float[Tensor, "h w"], ground: Float[Tensor, "h w"], shifted: bool) -> tuple[float, float, float]:
