@@ -219,7 +219,7 @@ def test_every_built_in_file_registers_a_provider(kind: type[Provider]) -> None:
 
 def test_which_recipes_decode_recorded_depth() -> None:
     reads = {name: PriorsConfig(depth=name).reads_recorded_depth for name in (*DEPTH.names(), "auto", "x.npz")}
-    assert [name for name, needed in reads.items() if not needed] == ["plane"]
+    assert [name for name, needed in reads.items() if not needed] == ["parallax", "plane"]
     DEPTH.add("lidar", type("Blind", (Lidar,), {"reads_recorded_depth": False}))
     assert not PriorsConfig(depth="lidar").reads_recorded_depth
 
