@@ -27,6 +27,7 @@ from lerobot_msdyn.core.errors import EpisodeError, MsdynError
 from lerobot_msdyn.core.fields import AUTO
 from lerobot_msdyn.dataset.convert import named_as_given
 from lerobot_msdyn.dataset.provenance import CALIBRATION
+from lerobot_msdyn.dataset.read import hand_on_nothing
 from lerobot_msdyn.dataset.rows import files_problem
 from lerobot_msdyn.dataset.staging import BACKGROUNDS
 from lerobot_msdyn.dataset.write import NewEpisode, OutputDataset
@@ -138,6 +139,7 @@ def _attempts(work: Work, episodes: list[int]) -> Generator[str | None]:
     workers = Workers(count, work)
     with workers:
         _ = replace(work, run=workers.moving).backgrounds  # before they are asked for by all at once
+        hand_on_nothing(work.source)
         yield from workers.map(attempt, episodes)
 
 

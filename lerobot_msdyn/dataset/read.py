@@ -247,6 +247,12 @@ def hand_on(meta: LeRobotDatasetMetadata, index: int, key: str, rgb: UInt8[Tenso
         meta.handed_on[index, key] = rgb
 
 
+def hand_on_nothing(meta: LeRobotDatasetMetadata) -> None:
+    """Forget what was handed on: others read it, in processes of their own."""
+    if isinstance(meta, Source):
+        meta.handed_on.clear()
+
+
 def read_depth(
     meta: LeRobotDatasetMetadata, index: int, key: str, rows: pa.Table, frames: Sequence[int] | None = None
 ) -> tuple[Float[Tensor, "t h w"], tuple[float, float]]:

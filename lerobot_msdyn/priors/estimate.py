@@ -10,7 +10,8 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.core.config import CameraConfig, Device, PriorsConfig
+from lerobot_msdyn.core.config import FIXED, CameraConfig, Device, PriorsConfig
+from lerobot_msdyn.core.fields import AUTO
 from lerobot_msdyn.core.observations import Origin, Priors, View
 from lerobot_msdyn.priors.cache import digest_of, open_cache
 from lerobot_msdyn.priors.camera.field_of_view import with_searched_fov
@@ -58,10 +59,10 @@ def estimate_priors(
     """
     cache, networks_on = open_cache(config.cache, view.rgb), chosen_device(device, networks=True).type
     request = Request(view, config, camera, cache, others, elsewhere, episode, key, networks_on)
-    instances, masks_from = _masks(request)
-    pinhole, camera_from = provide(
-        CameraProvider, camera.poses, request, lambda provider: provider.estimate(request, instances), file=CameraFile
-    )
+    told = camera.poses not in (AUTO, FIXED) and camera.known_before(key or "")  # by a file: whether it moves as well
+    posed = replace(request, view=replace(view, camera=_camera(request)[0])) if told else request
+    instances, masks_from = _masks(posed)
+    pinhole, camera_from = _camera(request, instances)
     robot = 0
     if view.robot is not None:
         instances, robot = with_robot(instances, view.robot)
@@ -119,12 +120,19 @@ def known_camera(
     Raises:
         PriorError: it cannot be had.
     """
-    request = Request(view, config, camera, open_cache("off", view.rgb), episode=episode, key=key)
-    nothing = torch.zeros(view.rgb.shape[:3], dtype=torch.uint8)
-    found: tuple[CameraTrack, Origin] = provide(
-        CameraProvider, camera.poses, request, lambda provider: provider.estimate(request, nothing), file=CameraFile
+    return _camera(Request(view, config, camera, open_cache("off", view.rgb), episode=episode, key=key))[0]
+
+
+def _camera(request: Request, instances: Masks | None = None) -> tuple[CameraTrack, Origin]:
+    """The camera, by what moves before it; where that need not be known, it may be left out."""
+    masks = torch.zeros(request.view.rgb.shape[:3], dtype=torch.uint8) if instances is None else instances
+    return provide(
+        CameraProvider,
+        request.camera.poses,
+        request,
+        lambda provider: provider.estimate(request, masks),
+        file=CameraFile,
     )
-    return found[0]
 
 
 def _before_poses(request: Request, camera: CameraTrack, depth: Depth) -> Masks:

@@ -306,8 +306,7 @@ def reconstruct(
 
     Videos are cut where the camera was moved, and long ones into windows, each with priors and a scene of its own, so
     that memory beyond the video itself is that of two windows, which are worked on at once. Windows share a background
-    as episodes do. The fit runs
-    on the recipe's device; the result is on the host.
+    as episodes do. The fit runs on the recipe's device; the result is on the host.
 
     Args:
         view: the video, at its own size.

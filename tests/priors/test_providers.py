@@ -17,6 +17,7 @@ from lerobot_msdyn.core.observations import BodyTracks, RobotSeen, View
 from lerobot_msdyn.priors import Priors, estimate_masks, estimate_priors
 from lerobot_msdyn.priors.camera.steadiness import camera_motion_px
 from lerobot_msdyn.priors.depth.table_plane import ground_plane
+from lerobot_msdyn.priors.exchange import Exchange, write_exchange
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.viewpoints import hand_held_camera
 
@@ -227,3 +228,18 @@ def test_before_a_camera_that_is_said_to_move_a_slow_way_is_no_sway() -> None:
         masks = estimate_masks(view, PriorsConfig(masks="change", cache="off"), CameraConfig(poses=poses)) > 0
         masked.append(float((masks & (seen.instances == 0)).float().mean()))
     assert masked[1] == masked[2] < 0.5 * masked[0]
+
+
+def test_a_file_of_poses_tells_the_masks_whether_the_camera_moves(tmp_path: Path) -> None:
+    width, height, frames = 160, 120, 24
+    camera = hand_held_camera(frames, width, height, 10.0)
+    seen = make_scene("push", 0, frames, width, height).render(camera)
+    recorded = View(seen.rgb, static_camera(camera.intrinsics[0], frames, width, height), seen.depth)
+    masked = {}
+    for name, poses in (("walks", camera.camera_from_world.numpy()), ("stands", None)):
+        content = Exchange(frames, height, width, K=camera.intrinsics.numpy(), w2c=poses)
+        write_exchange(tmp_path / f"{name}.npz", content)
+        config = PriorsConfig(masks="change", depth="plane", cache="off")
+        found = estimate_priors(recorded, config, CameraConfig(poses=str(tmp_path / f"{name}.npz")))
+        masked[name] = float(((found.instances > 0) & (seen.instances == 0)).float().mean())
+    assert masked["walks"] < 0.5 * masked["stands"]

@@ -11,8 +11,7 @@ from lerobot_msdyn.core.observations import DepthTraits
 from lerobot_msdyn.priors.cache import digest_of
 from lerobot_msdyn.priors.camera.sfm import SFM
 from lerobot_msdyn.priors.depth.parallax import as_maps, parallax_points, spread_out
-from lerobot_msdyn.priors.depth.providers.plane import Plane
-from lerobot_msdyn.priors.depth.table_plane import with_standing
+from lerobot_msdyn.priors.depth.table_plane import table_plane, with_standing
 from lerobot_msdyn.priors.depth.triangulate import Points
 from lerobot_msdyn.priors.registry import DEPTH, Corners, Depth, DepthProvider, Estimate, Masks, Unusable
 from lerobot_msdyn.priors.request import Request
@@ -42,13 +41,13 @@ class Parallax(DepthProvider):
         points = self._points(request, instances)
         ground = torch.from_numpy(spread_out(points, request.view.camera))
         how = f"between {sum(map(len, points.values()))} corners of {len(points)} frames"
-        return Estimate(self._in_unit(with_standing(ground, instances), request, instances), how)
+        return Estimate(self._in_unit(with_standing(ground, instances), request), how)
 
     def reference(self, request: Request, instances: Masks) -> Estimate[Depth]:
         """The corners alone."""
         points = self._points(request, instances)
         maps = torch.from_numpy(as_maps(points, *instances.shape))
-        depth = self._in_unit(maps, request, instances)
+        depth = self._in_unit(maps, request)
         unit = float(depth.z.sum() / maps.sum())
         return Estimate(replace(depth, corners=Corners(points, unit)), "corners that go by")
 
@@ -66,8 +65,10 @@ class Parallax(DepthProvider):
         return {int(frame): numbered[numbered[:, 0] == frame, 1:] for frame in np.unique(numbered[:, 0])}
 
     @staticmethod
-    def _in_unit(z: Float[Tensor, "t h w"], request: Request, instances: Masks) -> Depth:
-        metric = request.view.camera.origin != SFM
+    def _in_unit(z: Float[Tensor, "t h w"], request: Request) -> Depth:
+        camera, assumed = request.view.camera, request.camera
+        metric = camera.origin != SFM
         if not metric:
-            z = z * (Plane().estimate(request, instances).value.z.median() / z[z > 0].median())
+            table = table_plane(camera.width, camera.height, camera.intrinsics[0], assumed.height_m, assumed.tilt_deg)
+            z = z * (table.median() / z[z > 0].median())
         return Depth(z, DepthTraits(metric=metric, relative_error=RELATIVE_ERROR))

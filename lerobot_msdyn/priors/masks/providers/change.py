@@ -25,7 +25,9 @@ class Change(MaskProvider):
     def estimate(self, request: Request) -> Estimate[Masks]:
         """Frames of other episodes of the same fixed camera help, where there are any."""
         rgb, elsewhere = request.view.rgb, request.elsewhere
-        said_to_move = not request.view.camera.is_static or request.camera.poses not in (AUTO, FIXED)
+        poses = request.camera.poses
+        by_video = poses not in (AUTO, FIXED) and not request.camera.known_before(request.key or "")
+        said_to_move = not request.view.camera.is_static or by_video
         sway_px = FIXED_PX if said_to_move else SWAY_PX
 
         def compute() -> dict[str, np.ndarray]:
