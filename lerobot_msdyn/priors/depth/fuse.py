@@ -1,8 +1,9 @@
 """A network's depth before a fixed camera, put together with the ground that things stand on.
 
 What stands still has one depth throughout, from frames of all episodes where there are several. It is aligned once, to
-the ground; where the ground is known and not only assumed, what lies on it is put on it, and nothing is below. What
-moves keeps the network's depth unless that puts it behind its own foot, as small networks do with thin upright arms
+the ground; where the ground is known and not only assumed, what lies on it is put on it, and nothing is below. The less
+the network agrees with the ground, the more it is averaged with what is told to stand without it. What moves keeps the
+network's depth unless that puts it behind its own foot, as small networks do with thin upright arms
 (benchmarks/notes/priors.md): then it stands where its foot does.
 """
 
@@ -29,6 +30,8 @@ AGREES = 0.06  # the same, of those pixels that say how it is to be aligned
 FARTHEST_GROUND = 0.3  # share of the largest inverse depth of the ground, below which it is no evidence
 LEAST_GROUND = 0.15  # share of the pixels before that, that must agree
 TRIALS, SAMPLES = 600, 4000  # alignments by two pixels each; pixels that judge them
+OTHERWISE = 0.5  # share of depth without the network in what stands, where the network is off the ground by the most
+ABOVE = 0.999  # of the ground's depth: what is nearer stands, without the network
 BEHIND_FOOT = 1.15  # times as far as its foot: what moves is not there
 BEYOND_WALL = 1.5  # times as far as the wall that is assumed behind the ground, a network may see
 
@@ -49,7 +52,7 @@ def fused(
         inverse: inverse depth by the network, up to a factor; not finite = unknown.
         instances: what moves.
         ground: z-depth (m) of the ground and what is taken for a wall behind it.
-        standing: z-depth (m) where everything that moves stands on the ground.
+        standing: z-depth (m) without the network: what moves stands on the ground.
         elsewhere: the network's inverse depth of frames of all episodes of this camera.
         shifted: whether the network's inverse depth lacks a shift as well.
         known: whether the ground is known, and not only assumed.
@@ -74,6 +77,8 @@ def fused(
     if known:
         farthest = torch.where(ground < ground.max(), ground, BEYOND_WALL * ground)
         empty, moving = _above(empty, farthest.reciprocal(), near), torch.minimum(moving, farthest)
+        told = torch.where(standing < ABOVE * ground, standing.reciprocal(), empty)
+        empty = torch.lerp(empty, told, OTHERWISE * (near - NEAR_GROUND[0]) / (NEAR_GROUND[1] - NEAR_GROUND[0]))
     return torch.where(instances > 0, moving, empty.reciprocal())
 
 

@@ -44,13 +44,23 @@ def ground_plane(camera: CameraTrack, ground_m: float) -> Ground:
     return torch.where(descent > above / wall, above / descent.clamp(min=1e-6), wall)
 
 
-def with_standing(ground: Ground | Float[Tensor, "t h w"], instances: UInt8[Tensor, "t h w"]) -> Float[Tensor, "t h w"]:
-    """z-depth (m) of the ground, which may be another at every frame, and of upright things on it.
+def with_standing(
+    ground: Ground | Float[Tensor, "t h w"],
+    instances: UInt8[Tensor, "t h w"],
+    empty: Float[Tensor, "h w"] | None = None,
+) -> Float[Tensor, "t h w"]:
+    """z-depth (m) of what keeps still and of upright things on the ground.
 
     A moving instance has one depth per frame, that of the ground under its lowest rows, smoothed over time. Plausible,
     not metric: what is lifted, or hides its own foot, is put too far away or too near.
+
+    Args:
+        ground: z-depth (m) of the ground, which may be another at every frame.
+        instances: what moves.
+        empty: z-depth (m) of all that keeps still; None: of the ground.
     """
-    depth, rows = ground.expand(instances.shape), ground.median(dim=-1).values.expand(instances.shape[:2])
+    depth = (ground if empty is None else empty).expand(instances.shape)
+    rows = ground.median(dim=-1).values.expand(instances.shape[:2])
     for instance in range(1, int(instances.max()) + 1):
         mask = instances == instance
         if bool(mask.any()):

@@ -2,6 +2,7 @@
 
 from lerobot_msdyn.core.observations import DepthTraits
 from lerobot_msdyn.priors.depth.table_plane import ground_plane, table_plane, with_standing
+from lerobot_msdyn.priors.depth.uprights import empty_scene
 from lerobot_msdyn.priors.registry import DEPTH, Depth, DepthProvider, Estimate, Masks
 from lerobot_msdyn.priors.request import Request
 from lerobot_msdyn.priors.robot import RELATIVE_ERROR
@@ -11,6 +12,7 @@ from lerobot_msdyn.priors.robot import RELATIVE_ERROR
 class Plane(DepthProvider):
     """A table at the height and tilt that `camera.height_m` and `camera.tilt_deg` state, or under a calibrated robot.
 
+    Under a robot's table things that keep still stand upright, where edges say that they do.
     It can always be used.
     """
 
@@ -20,15 +22,16 @@ class Plane(DepthProvider):
 
     def estimate(self, request: Request, instances: Masks) -> Estimate[Depth]:
         """Assumed, not measured, but where a robot stands on the table."""
-        view = request.view
+        view, empty = request.view, None
         if view.robot is not None:
             ground = ground_plane(view.camera, view.robot.ground_m)
+            empty = empty_scene(view, view.robot, ground, instances) if view.camera.is_static else None
             traits = DepthTraits(metric=True, relative_error=RELATIVE_ERROR)
-            how = "the table that the robot stands on"
+            how = "the table that the robot stands on, and what stands on it"
         else:
             height_m, tilt_deg = request.camera.height_m, request.camera.tilt_deg
             width, height = view.camera.width, view.camera.height
             ground = table_plane(width, height, view.camera.intrinsics[0], height_m, tilt_deg)
             traits = DepthTraits(sharp=True, relative_error=0.10, assumed=True)
             how = f"a table seen from {height_m:g} m at {tilt_deg:g} degrees"
-        return Estimate(Depth(with_standing(ground, instances), traits, ground), how)
+        return Estimate(Depth(with_standing(ground, instances, empty), traits, ground), how)
