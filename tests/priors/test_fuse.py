@@ -101,6 +101,28 @@ def test_a_thing_that_the_network_sees_well_keeps_its_depth(distance: float) -> 
     assert found[instances > 0].median().item() == pytest.approx(distance * GROUND[40, 0].item(), rel=0.02)
 
 
+def rough(inverse: torch.Tensor, share: float) -> torch.Tensor:
+    """What a network says that is off by as much everywhere."""
+    noise = torch.rand(HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    return inverse * (1 + share * noise)
+
+
+@pytest.mark.parametrize(("share", "distance"), [(0.003, 0.7), (0.08, 1.0)])
+def test_what_moves_stands_on_its_foot_where_the_network_is_poor(share: float, distance: float) -> None:
+    inverse, instances = thing(0.7)
+    found = put_together(rough(inverse, share), instances)
+    assert found[instances > 0].median().item() == pytest.approx(distance * GROUND[40, 0].item(), rel=0.06)
+
+
+@pytest.mark.parametrize(("share", "part"), [(0.003, 0.0), (0.08, 0.5)])
+def test_a_poor_network_is_averaged_with_what_is_told_to_stand_without_it(share: float, part: float) -> None:
+    told = GROUND.clone()
+    told[UPPER] = 0.8 * GROUND[33, 0]
+    found = fused(rough(1 / clip(scene()), share), NOTHING, GROUND, clip(told), None, shifted=True, known=True)
+    inverse = (1 - part) / scene()[UPPER] + part / told[UPPER]
+    assert (1 / found[0][UPPER]).median().item() == pytest.approx(inverse.median().item(), rel=0.05)
+
+
 def test_what_moves_is_not_below_the_ground() -> None:
     instances, depth = NOTHING.clone(), clip(scene())
     instances[:, 30:46, 20:50] = 1  # lies on the ground, and the network is off

@@ -77,8 +77,11 @@ def fused(
     if known:
         farthest = torch.where(ground < ground.max(), ground, BEYOND_WALL * ground)
         empty, moving = _above(empty, farthest.reciprocal(), near), torch.minimum(moving, farthest)
+        distrust = (near - NEAR_GROUND[0]) / (NEAR_GROUND[1] - NEAR_GROUND[0])
         told = torch.where(standing < ABOVE * ground, standing.reciprocal(), empty)
-        empty = torch.lerp(empty, told, OTHERWISE * (near - NEAR_GROUND[0]) / (NEAR_GROUND[1] - NEAR_GROUND[0]))
+        empty = torch.lerp(empty, told, OTHERWISE * distrust)
+        both = torch.lerp(moving.reciprocal(), standing.reciprocal(), distrust).reciprocal()
+        moving = torch.where(moving > 0, both, 0.0)
     return torch.where(instances > 0, moving, empty.reciprocal())
 
 
