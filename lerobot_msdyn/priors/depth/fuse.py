@@ -1,10 +1,10 @@
 """A network's depth before a fixed camera, put together with the ground that things stand on.
 
 What stands still has one depth throughout, from frames of all episodes where there are several. It is aligned once, to
-the ground; where the ground is known and not only assumed, what lies on it is put on it, and nothing is below. The less
-the network agrees with the ground, the more it is averaged with what is told to stand without it. What moves keeps the
-network's depth unless that puts it behind its own foot, as small networks do with thin upright arms
-(benchmarks/notes/priors.md): then it stands where its foot does.
+the ground; where the ground is known and not only assumed, what lies on it is put on it, and nothing is below. What
+moves keeps the network's depth unless that puts it behind its own foot, as small networks do with thin upright arms
+(benchmarks/notes/priors.md): then it stands where its foot does. The less the network agrees with a known ground, the
+more counts what is told without it: of what stands up to a half, of what moves up to all.
 """
 
 import cv2
