@@ -320,5 +320,5 @@ SWEEPS: dict[str, dict[str, Row]] = {
     "variants": {f"variants {n}": replace(_many, variants=n) for n in (1, 2, 3, 6, 10)},
     "max_unseen": _swept("max_unseen", "max_unseen", (0.05, 0.1, 0.4, 1.0)),
     "fill": _swept("fill", "fill", ("nearest", "none")) | {"crop": _changed("crop", "--crop_to_covered=true")},
-    "gate": _swept("min_expected_db", "gate.min_expected_db", (0, 12, 16, 18)),
+    "gate": _swept("min_expected_db", "gate.min_expected_db", (0, 22, 26)),
 }

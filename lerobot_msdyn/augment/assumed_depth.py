@@ -42,7 +42,7 @@ def say_assumed_depth(source: LeRobotDatasetMetadata, cameras: Sequence[str], co
         except PriorError as error:
             raise PriorError(f"{error}; without --fetch_models true depth is that of an assumed table plane") from error
         return
-    assumed = "the table that the robot stands on"
+    assumed = "the table that the robot stands on, and what vertical edges say of things on it"
     if config.allow_moving and (config.camera.pose_columns or config.camera.poses not in (AUTO, FIXED)):
         assumed = "what the camera's own way tells, which is smooth between corners"
     elif config.camera.calibration is None:

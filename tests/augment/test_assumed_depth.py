@@ -55,7 +55,10 @@ def test_the_plane_is_announced_with_the_better_model_and_its_size_in_one_line(f
 def test_of_a_calibrated_robot_the_table_is_named(fetched, caplog) -> None:
     config = AugmentConfig(camera=CameraConfig(calibration=Path("calibration.json")))
     [line] = said(caplog, config)
-    assert line.startswith("no recorded depth: scenes are built on the table that the robot stands on; ")
+    assert line.startswith(
+        "no recorded depth: scenes are built on the table that the robot stands on, and what vertical edges "
+        "say of things on it; "
+    )
     assert "99 MB" in line
     caplog.clear()
     assert "several calibrated cameras" in said(caplog, config, ("front", "side"))[0]
