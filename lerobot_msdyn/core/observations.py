@@ -19,6 +19,7 @@ class DepthTraits:
     sharp: bool = False  # edges stand where those of the image do, and frames agree with each other
     relative_error: int | float = 0.05  # share of the depth by which it may be off without the video showing it
     assumed: bool = False  # nothing was measured: it is no evidence against any image
+    still_error: int | float = 0.0  # the relative error of what keeps still, if that is more
 
     @property
     def measured(self) -> bool:

@@ -99,6 +99,7 @@ def self_check(
         )
     following = (frames + 1).clamp(max=total - 1)
     still = stands_still(moving) & stands_still(priors.instances[following] > 0)
+    traits = priors.depth_traits
     return SelfCheck(
         frames,
         len(held_out) > 0,
@@ -113,7 +114,7 @@ def self_check(
         similarity(alone, recorded),
         _track_residual(scene, view.camera, priors),
         flicker(recorded, view.rgb[following].float() / 255, still),
-        max(priors.depth_traits.relative_error, unsteadiness(priors) if view.camera.is_static else 0.0),
+        max(traits.relative_error, traits.still_error, unsteadiness(priors) if view.camera.is_static else 0.0),
         skew,
         fast,
     )

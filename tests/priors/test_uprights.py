@@ -15,6 +15,7 @@ from lerobot_msdyn.priors.depth.uprights import (
     Upright,
     empty_picture,
     empty_scene,
+    still_error,
     vertical_edges,
     wall_m,
 )
@@ -176,3 +177,12 @@ def test_a_camera_that_leans_to_the_side() -> None:
     up = np.array([np.sin(0.5), -np.cos(0.5), 0.0])
     assert not Upright.before(up, rays, 0.4).usable
     assert Upright.before(np.array([0.0, -1.0, 0.0]), rays, 0.4).usable
+
+
+def test_the_more_stands_the_less_is_sure() -> None:
+    ground = torch.ones(10, 10)
+    ground[:2] = 2.0
+    standing = ground.clone()
+    standing[2:5] = 0.5
+    assert still_error(ground, ground) == pytest.approx(0.2 * 0.11 + 0.8 * 0.02)
+    assert still_error(standing, ground) == pytest.approx(0.5 * 0.11 + 0.5 * 0.02)

@@ -2,7 +2,7 @@
 
 from lerobot_msdyn.core.observations import DepthTraits
 from lerobot_msdyn.priors.depth.table_plane import ground_plane, table_plane, with_standing
-from lerobot_msdyn.priors.depth.uprights import empty_scene
+from lerobot_msdyn.priors.depth.uprights import empty_scene, still_error
 from lerobot_msdyn.priors.registry import DEPTH, Depth, DepthProvider, Estimate, Masks
 from lerobot_msdyn.priors.request import Request
 from lerobot_msdyn.priors.robot import RELATIVE_ERROR
@@ -25,8 +25,8 @@ class Plane(DepthProvider):
         view, empty = request.view, None
         if view.robot is not None:
             ground = ground_plane(view.camera, view.robot.ground_m)
-            empty = empty_scene(view, view.robot, ground, instances) if view.camera.is_static else None
-            traits = DepthTraits(metric=True, relative_error=RELATIVE_ERROR)
+            empty = empty_scene(view, view.robot, ground, instances) if view.camera.is_static else ground
+            traits = DepthTraits(metric=True, relative_error=RELATIVE_ERROR, still_error=still_error(empty, ground))
             how = "the table that the robot stands on, and what stands on it"
         else:
             height_m, tilt_deg = request.camera.height_m, request.camera.tilt_deg
