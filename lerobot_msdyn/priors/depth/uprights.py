@@ -131,12 +131,14 @@ def with_uprights(
         intrinsics: of the camera.
         upright: the vertical before it.
     """
+    if not upright.usable:
+        return ground
     behind = ground >= WALL * ground.max()
     edges = vertical_edges(picture, intrinsics, upright.down)
     edges = [edge for edge in edges if unknown[edge.rows, edge.columns].mean() < 0.5]
     labels = _first_labels(edges, behind, unknown)
     stands = _no_ground(picture, labels)
-    if not upright.usable or not stands.any():
+    if not stands.any():
         return ground
     distance = ground * upright.ahead
     wall = wall_m(stands, unknown, distance, behind)
