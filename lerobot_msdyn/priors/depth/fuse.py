@@ -30,7 +30,8 @@ AGREES = 0.06  # the same, of those pixels that say how it is to be aligned
 FARTHEST_GROUND = 0.3  # share of the largest inverse depth of the ground, below which it is no evidence
 LEAST_GROUND = 0.15  # share of the pixels before that, that must agree
 TRIALS, SAMPLES = 600, 4000  # alignments by two pixels each; pixels that judge them
-OTHERWISE = 0.5  # share of depth without the network in what stands, where the network is off the ground by the most
+TRUSTED = (0.03, 0.06)  # share of inverse depth by which a network is off the ground: it counts in full, and least
+OTHERWISE = 0.5  # share of depth without the network in what stands, where the network counts least
 ABOVE = 0.999  # of the ground's depth: what is nearer stands, without the network
 BEHIND_FOOT = 1.15  # times as far as its foot: what moves is not there
 BEYOND_WALL = 1.5  # times as far as the wall that is assumed behind the ground, a network may see
@@ -76,8 +77,8 @@ def fused(
     moving = _not_behind_feet(depth, instances, standing)
     if known:
         farthest = torch.where(ground < ground.max(), ground, BEYOND_WALL * ground)
+        distrust = _distrust(empty, ground, torch.where(instances == 0, standing, torch.inf).amin(0))
         empty, moving = _above(empty, farthest.reciprocal(), near), torch.minimum(moving, farthest)
-        distrust = (near - NEAR_GROUND[0]) / (NEAR_GROUND[1] - NEAR_GROUND[0])
         told = torch.where(standing < ABOVE * ground, standing.reciprocal(), empty)
         empty = torch.lerp(empty, told, OTHERWISE * distrust)
         both = torch.lerp(moving.reciprocal(), standing.reciprocal(), distrust).reciprocal()
@@ -144,6 +145,21 @@ def _above(inverse: Float[Tensor, "h w"], ground: Float[Tensor, "h w"], near: fl
     for operation in (cv2.MORPH_OPEN, cv2.MORPH_CLOSE):
         stands = cv2.morphologyEx(stands, operation, window)
     return torch.where(torch.from_numpy(stands > 0), torch.maximum(inverse, ground), ground)
+
+
+def _distrust(inverse: Float[Tensor, "h w"], ground: Float[Tensor, "h w"], still: Float[Tensor, "h w"]) -> float:
+    """How little a network counts, 0..1, by how far off it is where the ground is seen.
+
+    Args:
+        inverse: inverse depth of what is empty, by the network, aligned.
+        ground: z-depth (m).
+        still: z-depth (m) of what keeps still, without the network; infinite where something moves throughout.
+    """
+    lies = (still >= ABOVE * ground) & torch.isfinite(still) & (ground < ground.max())
+    if not bool(lies.any()):
+        return 0.0
+    off = float((inverse * ground - 1).abs()[lies].quantile(SPREAD))
+    return min(max((off - TRUSTED[0]) / (TRUSTED[1] - TRUSTED[0]), 0.0), 1.0)
 
 
 def _not_behind_feet(
