@@ -16,6 +16,7 @@ from torch import Tensor
 from lerobot_msdyn.core.errors import PriorError
 from lerobot_msdyn.core.sampling import evenly, scaled_px
 from lerobot_msdyn.priors.depth.align import MAX_FACTOR, scale_alone, scale_and_shift
+from lerobot_msdyn.priors.depth.uprights import ON_GROUND
 
 MOST_FRAMES = 60  # that what is empty is told by
 # Quantile of inverse depth over frames that stands for what is empty: networks draw what is around a near thing towards
@@ -32,7 +33,6 @@ LEAST_GROUND = 0.15  # share of the pixels before that, that must agree
 TRIALS, SAMPLES = 600, 4000  # alignments by two pixels each; pixels that judge them
 TRUSTED = (0.03, 0.06)  # share of inverse depth by which a network is off the ground: it counts in full, and least
 OTHERWISE = 0.5  # share of depth without the network in what stands, where the network counts least
-ABOVE = 0.999  # of the ground's depth: what is nearer stands, without the network
 BEHIND_FOOT = 1.15  # times as far as its foot: what moves is not there
 BEYOND_WALL = 1.5  # times as far as the wall that is assumed behind the ground, a network may see
 
@@ -79,7 +79,7 @@ def fused(
         farthest = torch.where(ground < ground.max(), ground, BEYOND_WALL * ground)
         distrust = _distrust(empty, ground, torch.where(instances == 0, standing, torch.inf).amin(0))
         empty, moving = _above(empty, farthest.reciprocal(), near), torch.minimum(moving, farthest)
-        told = torch.where(standing < ABOVE * ground, standing.reciprocal(), empty)
+        told = torch.where(standing < ON_GROUND * ground, standing.reciprocal(), empty)
         empty = torch.lerp(empty, told, OTHERWISE * distrust)
         both = torch.lerp(moving.reciprocal(), standing.reciprocal(), distrust).reciprocal()
         moving = torch.where(moving > 0, both, 0.0)
@@ -155,7 +155,7 @@ def _distrust(inverse: Float[Tensor, "h w"], ground: Float[Tensor, "h w"], still
         ground: z-depth (m).
         still: z-depth (m) of what keeps still, without the network; infinite where something moves throughout.
     """
-    lies = (still >= ABOVE * ground) & torch.isfinite(still) & (ground < ground.max())
+    lies = (still >= ON_GROUND * ground) & torch.isfinite(still) & (ground < ground.max())
     if not bool(lies.any()):
         return 0.0
     off = float((inverse * ground - 1).abs()[lies].quantile(SPREAD))
