@@ -73,8 +73,8 @@ def depth_of(picture: ndarray, pose: ndarray, hidden: ndarray | None = None) -> 
     """The empty scene's depth, and the ground's."""
     frames = 3
     rgb = torch.from_numpy(picture).expand(frames, -1, -1, -1).contiguous()
-    track = [torch.from_numpy(each).float().expand(frames, -1, -1).contiguous() for each in (K, pose)]
-    camera = CameraTrack(*track, WIDTH, HEIGHT, origin="calibration")
+    intrinsics, poses = (torch.from_numpy(each).float().expand(frames, -1, -1).contiguous() for each in (K, pose))
+    camera = CameraTrack(intrinsics, poses, WIDTH, HEIGHT, origin="calibration")
     ground = ground_plane(camera, 0.0)
     instances = torch.zeros(frames, HEIGHT, WIDTH, dtype=torch.uint8)
     if hidden is not None:
