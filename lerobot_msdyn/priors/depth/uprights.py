@@ -21,7 +21,7 @@ from lerobot_msdyn.core.observations import RobotSeen, View
 from lerobot_msdyn.core.sampling import evenly, scaled_px, scaled_window
 
 FRAMES = 40  # that the empty picture is made of
-MARGIN_PX = 2.0  # of 320: about what moves
+MARGIN_PX = 5.0  # of 320: about what moves
 DETECTED_PX = 640  # width at which edges are looked for; smaller pictures are enlarged
 VERTICAL_DEG = 4.0  # by which a vertical edge may be off
 LEAST_PX = 6.0  # of 320: the shortest vertical edge
@@ -77,6 +77,14 @@ class Edge:
     columns: Int[ndarray, " n"]
 
 
+@dataclass(frozen=True)
+class Thing:
+    """Something upright."""
+
+    pixels: Bool[ndarray, "h w"]
+    edges: list[Edge]  # vertical ones
+
+
 def empty_scene(
     view: View, robot: RobotSeen, ground: Float[Tensor, "h w"], instances: UInt8[Tensor, "t h w"]
 ) -> Float[Tensor, "h w"]:
@@ -108,7 +116,7 @@ def empty_picture(
 ) -> tuple[UInt8[ndarray, "h w 3"], Bool[ndarray, "h w"]]:
     """Median over frames in which a pixel is not hidden, and where it is so in most; there it is filled."""
     some = evenly(len(rgb), FRAMES).numpy()
-    window = scaled_window(2 * MARGIN_PX + 1, rgb.shape[2])
+    window = scaled_window(MARGIN_PX, rgb.shape[2])
     grown = np.stack([cv2.dilate(mask.astype(np.uint8), window) > 0 for mask in hidden[some]])
     picture = masked_median(rgb[some], ~grown[..., None]).round().astype(np.uint8)
     unknown = grown.mean(0) > 0.5
@@ -148,13 +156,14 @@ def with_uprights(
     wall = wall_m(stands, unknown, distance, behind)
     before = stands & ~unknown & (distance < BEFORE_WALL * wall)
     depth = np.minimum(ground, wall / upright.ahead) if np.isfinite(wall) else ground.copy()
-    for its, own in _things(before, distance, edges):
-        feet = _lowest(its)
+    for thing in _things(before, distance, edges):
+        its, feet = thing.pixels, _lowest(thing.pixels)
         known = ~unknown[(feet + 1).clip(max=len(unknown) - 1), np.arange(len(feet))]  # else it may reach farther down
         card = distance[feet, np.arange(len(feet))] / upright.ahead
         above = 1 - card * upright.falls  # of the camera's height
         columns = np.flatnonzero(its.any(0))
-        high = np.quantile([above[edge.rows[0], edge.columns[0].clip(columns[0], columns[-1])] for edge in own], HIGH)
+        ends = [(edge.rows[0], edge.columns[0].clip(columns[0], columns[-1])) for edge in thing.edges]
+        high = np.quantile([above[end] for end in ends], HIGH)
         top = np.where(upright.falls > 0, (1 - high) / upright.falls.clip(min=1e-6), np.inf)
         depth = np.where(its & known, np.minimum(depth, np.maximum(card, top)), depth)
     return depth.astype(np.float32)
@@ -213,12 +222,12 @@ def _first_labels(
 
 
 def _more_labels(
-    labels: UInt8[ndarray, "h w"], stands: Bool[ndarray, "h w"], things: list[tuple[Bool[ndarray, "h w"], list[Edge]]]
+    labels: UInt8[ndarray, "h w"], stands: Bool[ndarray, "h w"], things: list[Thing]
 ) -> UInt8[ndarray, "h w"]:
     """What it goes on with: things that were found are no ground, and what is between their pixels is probably none."""
     known = np.isin(labels, (cv2.GC_FGD, cv2.GC_BGD))
     labels = np.where(known, labels, np.where(stands, cv2.GC_PR_FGD, cv2.GC_PR_BGD)).astype(np.uint8)
-    for its, _ in things:
+    for its in (thing.pixels for thing in things):
         rows, columns = np.flatnonzero(its.any(1)), np.flatnonzero(its.any(0))
         box = labels[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
         box[box == cv2.GC_PR_BGD] = cv2.GC_PR_FGD
@@ -260,10 +269,8 @@ def wall_m(
     return min(wall, BEHIND_GROUND * float(np.median(distance[end, columns][seen]))) if seen.any() else wall
 
 
-def _things(
-    before: Bool[ndarray, "h w"], distance: Float[ndarray, "h w"], edges: list[Edge]
-) -> list[tuple[Bool[ndarray, "h w"], list[Edge]]]:
-    """Pixels of each upright thing, and its vertical edges.
+def _things(before: Bool[ndarray, "h w"], distance: Float[ndarray, "h w"], edges: list[Edge]) -> list[Thing]:
+    """What stands upright.
 
     Args:
         before: what is no ground, and nearer than the wall.
@@ -284,7 +291,7 @@ def _things(
             own = [edge for edge in edges if _is_of(edge, its)]
             middles = [edge.columns.mean() for edge in own]
             if len(own) >= LEAST_EDGES and np.ptp(middles) >= SPANNED * len(some):
-                things.append((its, own))
+                things.append(Thing(its, own))
     return things
 
 
