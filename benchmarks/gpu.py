@@ -8,8 +8,9 @@ rasterizer   ms per render and per render with gradients, 8 channels; peak memor
              kernel runs
 parity       pictures and gradients against the CPU route and against the reference in float64
 psnr         the same short video fitted on both routes: held-out PSNR, which should differ by less than 0.2 dB
-episode      a synthetic episode by `augment`, two variants, whole; its fit (ms per step, share outside kernels), the
-             frames per second of rendering alone and with holes filled, peak memory
+episode      a synthetic episode by `augment`, two variants, whole, from a cold start and again; the seconds of each
+             step of its reconstruction; its fit (ms per step, share outside kernels), the frames per second of rendering
+             alone and with holes filled, peak memory
 several      as many short episodes, one after the other and at the same time
 
 `--device cpu` with small sizes tries the script itself where there is no GPU; parity is then of the CPU route.
@@ -194,17 +195,20 @@ def psnr(target: Device, options: argparse.Namespace) -> Iterator[dict]:
 
 def episode(target: Device, options: argparse.Namespace, folder: Path) -> Iterator[dict]:
     """A whole episode by the command, and its parts."""
-    root = _dataset(folder / "one", 1, options.frames, options.width, options.height)
-    row: dict = {"case": f"{options.frames} frames {options.width}x{options.height}, 2 variants, {options.recipe}"}
-    with target.peak_mb(row):
-        row["whole s"] = _augmented(root, folder / "out", options, target)
-    yield row
+    root = _dataset((options.datasets or folder) / "one", 1, options.frames, options.width, options.height)
+    size = f"{options.frames} frames {options.width}x{options.height}, 2 variants, {options.recipe}"
+    for start in ("cold", "again"):
+        row: dict = {"case": f"{size}, {start}"}
+        with target.peak_mb(row):
+            row["whole s"] = _augmented(root, folder / f"out_{start}", options, target)
+        yield row
     config = _config(options, target.backend)
     source = open_source("local/bench", root)
     view = read_episode(source, 0, [KEY], config.camera).views[KEY]
     row = {"case": "its fit"}
     with target.peak_mb(row):
         scene = reconstruct(view, config)
+    yield {"case": "seconds by step"} | scene.seconds
     row |= {"fit s": scene.seconds["fit"], "ms per step": 1e3 * scene.seconds["fit"] / scene.windows[0].fit_steps}
     if target.is_cuda:
         row["outside kernels"] = 1 - _fit_kernel_ms(target, view, config) / row["ms per step"]
@@ -236,7 +240,9 @@ def _fit_kernel_ms(target: Device, view: View, config: AugmentConfig, steps: int
 def several(target: Device, options: argparse.Namespace, folder: Path) -> Iterator[dict]:
     """Short episodes one after the other, and at the same time."""
     count = options.episodes
-    root = _dataset(folder / "several", count, options.frames // 3, options.width // 2, options.height // 2)
+    root = _dataset(
+        (options.datasets or folder) / "several", count, options.frames // 3, options.width // 2, options.height // 2
+    )
     for at_once in (1, count):
         row: dict = {"case": f"{count} short episodes, {at_once} at once"}
         with target.peak_mb(row):
@@ -253,6 +259,8 @@ def _config(options: argparse.Namespace, device: str) -> AugmentConfig:
 
 
 def _dataset(root: Path, episodes: int, frames: int, width: int, height: int) -> Path:
+    if root.exists():
+        return root
     scenes = [make_scene("push", 0, frames, width, height, episode=index) for index in range(episodes)]
     write_dataset(scenes, "local/bench", root, cameras=["front"], depth=True)
     return root
@@ -290,6 +298,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--height", type=int, default=480)
     parser.add_argument("--episodes", type=int, default=4)
     parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
+    parser.add_argument("--datasets", type=Path, help="folder of the synthetic datasets; those found there are used")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     target = Device(options.device)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from .cameras import DISTANCE_M, Placement, intrinsics, product_pose, random_placement, table_homography
+from .cameras import Placement, intrinsics, product_pose, random_placement, table_homography
 from .forms import Form
 from .store import Store
 
@@ -205,7 +205,6 @@ def product(
     path: Path,
     flags: tuple[str, ...] = (WITHOUT_JOINTS,),
     *,
-    wide: bool = False,
     scenes_of: str = "",
     of: str = RECORDED,
     network: bool = False,
@@ -216,7 +215,6 @@ def product(
         sets: all of them.
         path: where it goes.
         flags: of the command.
-        wide: from poses of the oracle's range.
         scenes_of: a row whose scenes are rendered; else they are fitted.
         of: the row that is the recording.
         network: whether depth is the network's.
@@ -224,12 +222,6 @@ def product(
     source = sets.folder(ROWS[of])
     given = [f"--root={source}", f"--new_root={path}", "--new_repo_id=local/policy_msdyn", "--repo=local/policy"]
     given += [f"--variants={sets.form.variants}", f"--workers={sets.workers}"]
-    if wide:
-        given += [
-            f"--perturbation.azimuth_deg={sets.form.range_deg}",
-            f"--perturbation.translation_m={sets.form.range_m}",
-            f"--perturbation.translation_rel={sets.form.range_m / DISTANCE_M:.2f}",
-        ]
     if scenes_of:
         given += [f"--scenes={sets.folder(ROWS[scenes_of])}"]
     if network:
@@ -280,9 +272,6 @@ ROWS: dict[str, Row] = {
     "homography": Row("homography", homography),
     "product": Row("product", product),
     FITTED: Row("product_joints", partial(product, flags=(*WITH_JOINTS, "--save_scenes=true"))),
-    f"{FITTED}, the oracle's range": Row(
-        "product_joints_wide", partial(product, flags=(), wide=True, scenes_of=FITTED)
-    ),
     f"{FITTED} and a depth network": Row(
         "product_network", partial(product, flags=WITH_JOINTS, network=True), network=True
     ),
@@ -292,8 +281,8 @@ ROWS: dict[str, Row] = {
 
 
 def _changed(name: str, *flags: str) -> Row:
-    """The product with joints, at the oracle's range, with some flags changed; nothing is fitted again."""
-    return Row(f"product_joints_{name}", partial(product, flags=flags, wide=True, scenes_of=FITTED))
+    """The product with joints, with some flags changed; nothing is fitted again."""
+    return Row(f"product_joints_{name}", partial(product, flags=flags, scenes_of=FITTED))
 
 
 def _swept(name: str, field: str, values: Iterable[Any]) -> dict[str, Row]:
@@ -306,11 +295,12 @@ _many = _changed("variants_10", "--variants=10")  # whose first n are those of n
 SWEEPS: dict[str, dict[str, Row]] = {
     "range": {
         "product": ROWS["product"],
-        "product, the oracle's range": Row("product_wide", partial(product, wide=True)),
+        "product within 15": Row(
+            "product_15", partial(product, flags=(WITHOUT_JOINTS, "--perturbation.azimuth_deg=15"))
+        ),
         FITTED: ROWS[FITTED],
-        f"{FITTED}, the oracle's range": ROWS[f"{FITTED}, the oracle's range"],
     }
-    | _swept("range", "perturbation.azimuth_deg", (5, 20, 30)),
+    | _swept("within", "perturbation.azimuth_deg", (5, 10, 20, 30)),
     "sampling": {
         "oracle, one pose per frame": Row("oracle_per_frame", oracle_per_frame),
         "one pose per frame": _changed("per_frame", "--perturbation.per_frame=true"),

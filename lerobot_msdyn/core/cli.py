@@ -233,6 +233,8 @@ def _unknown_fields(config_class: type, merged: dict[str, Any], part: dict[str, 
         if typing.get_origin(field_class) is dict and not isinstance(value, dict):
             lines.append(f"{prefix + key!r} is {value!r}; expected a mapping")
         if not dataclasses.is_dataclass(field_class):
+            if value is None and type(None) not in typing.get_args(field_class):
+                lines.append(f"{prefix + key!r} is null; expected a value")
             if field_class is str and isinstance(value, list | dict):
                 lines.append(f"{prefix + key!r} is {value!r}; expected text")
             continue

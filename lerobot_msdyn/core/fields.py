@@ -16,8 +16,8 @@ MAX_SEED = 4_294_967_295
 MAX_WEIGHT = 1e6  # of a loss term
 
 
-def between(default: Number, low: Number, high: Number) -> Any:
-    """A number from `low` to `high`."""
+def between(default: Number | None, low: Number, high: Number) -> Any:
+    """A number from `low` to `high`; where the default is none, also none."""
     return field(default=default, metadata={"range": (low, high)})
 
 
@@ -44,7 +44,7 @@ def problems(config: Any, prefix: str = "") -> list[str]:
             lines += problems(value, f"{name}.")
         elif isinstance(value, dict):
             lines += _dict_problems(value, name, item.metadata)
-        elif "range" in item.metadata:
+        elif "range" in item.metadata and not (value is None and item.default is None):
             lines += _range_problems(value, name, *item.metadata["range"])
         elif "names" in item.metadata:
             registry: Registry | None = item.metadata["registry"]

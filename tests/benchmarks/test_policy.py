@@ -235,7 +235,6 @@ def test_the_whole_study_in_tiny_form(tmp_path: Path) -> None:
         "homography": 0,
         "product": 0,
         "product_joints": 0,
-        "product_joints_wide": 0,
         "product_depth": 0,
         "oracle_product": 0,
     }

@@ -61,6 +61,7 @@ def test_a_switch_needs_no_value() -> None:
 
 def test_another_perturbation_type_drops_the_fields_of_the_old_one() -> None:
     assert parse("--perturbation.azimuth_deg", "4").perturbation == Orbit(azimuth_deg=4.0)
+    assert parse("--perturbation.azimuth_deg", "null").perturbation == Orbit(azimuth_deg=None)
     found = parse("--recipe", "quick", "--perturbation.type", "jitter", "--perturbation.rotation_deg", "2")
     assert found.perturbation == Jitter(rotation_deg=2.0)
 
@@ -83,6 +84,7 @@ def test_another_perturbation_type_drops_the_fields_of_the_old_one() -> None:
         (["--include_source", "maybe"], "include_source.*maybe.*bool"),
         (["--perturbation.type", "shake"], "perturbation.type is 'shake'; expected one of dolly, drift, focal, jitter"),
         (["--perturbation.azimuth_deg", "-3"], "perturbation.azimuth_deg is -3.0; expected a value from 0 to 90"),
+        (["--perturbation.elevation_deg", "null"], "'perturbation.elevation_deg' is null; expected a value"),
         (["--perturbation.type", "focal", "--perturbation.zoom", "-1"], "perturbation.zoom is -1.0; expected"),
         (["--perturbation.type", "poses"], "perturbation.poses is empty"),
         (

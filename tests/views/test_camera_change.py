@@ -91,6 +91,16 @@ def test_samples_lie_in_the_range(config: Perturbation, bounds: list[float]) -> 
     assert (largest >= 0.8 * torch.tensor(bounds)).all()
 
 
+def test_orbit_turns_further_where_the_scale_is_metric_unless_told_how_far() -> None:
+    def largest(config: Orbit, *, metric: bool) -> float:
+        return float(torch.cat([amounts(config, variant, metric=metric) for variant in range(32)])[:, 0].abs().max())
+
+    assert 12 < largest(Orbit(), metric=True) <= 15
+    assert 8 < largest(Orbit(), metric=False) <= 10
+    for metric in (True, False):
+        assert 3.2 < largest(Orbit(azimuth_deg=4.0), metric=metric) <= 4
+
+
 def test_jitter_is_normally_distributed() -> None:
     samples = torch.cat([amounts(Jitter(rotation_deg=2.0), variant) for variant in range(256)])[:, 5:8]
     assert samples.std(0).tolist() == pytest.approx([2.0] * 3, rel=0.05)
