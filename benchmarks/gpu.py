@@ -9,8 +9,8 @@ rasterizer   ms per render and per render with gradients, 8 channels; peak memor
 parity       pictures and gradients against the CPU route and against the reference in float64
 psnr         the same short video fitted on both routes: held-out PSNR, which should differ by less than 0.2 dB
 episode      a synthetic episode by `augment`, two variants, whole, from a cold start and again; the seconds of each
-             step of its reconstruction; its fit (ms per step, share outside kernels), the frames per second of rendering
-             alone and with holes filled, peak memory
+             step of its reconstruction; its fit (ms per step, share outside kernels), the frames per second of
+             rendering alone and with holes filled, peak memory
 several      as many short episodes, one after the other and at the same time
 
 `--device cpu` with small sizes tries the script itself where there is no GPU; parity is then of the CPU route.
