@@ -4,12 +4,15 @@ import torch
 from gsplat import rasterization
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from lerobot_msdyn.core.errors import RenderError
 from lerobot_msdyn.core.geometry import transform_points
 from lerobot_msdyn.render.reference import rasterize_reference, renderable
 from lerobot_msdyn.render.types import COVARIANCE_BLUR, QUAT_LENGTHS, Raster
 from lerobot_msdyn.render.validation import check_values
+
+WARP = 32  # threads that add their gradients up before they are written
 
 
 def rasterize_cuda(
@@ -62,13 +65,19 @@ def render_with_gsplat(
     """The same, unchecked, of one Gaussian or more.
 
     gsplat takes either one scene for all views or one for each, not a mix: all tensors are given per view. What the
-    reference does not render gets an opacity of zero, by which gsplat leaves it out as well.
+    reference does not render gets an opacity of zero, by which gsplat leaves it out as well. So do Gaussians that are
+    added to fill the last warp of each view: gsplat 1.5 adds up the gradients of poses within a warp, whatever views
+    its threads belong to.
     """
     views = len(camera_from_world)
     means, quats, scales, opacities, features = (
         values if values.ndim > rank else values.expand(views, *values.shape)
         for values, rank in ((means, 2), (quats, 2), (scales, 2), (opacities, 1), (features, 2))
     )
+    missing = -means.shape[1] % WARP if views > 1 else 0
+    if missing:
+        means, scales, features = (pad(values, (0, 0, 0, missing)) for values in (means, scales, features))
+        quats, opacities = pad(quats, (0, 0, 0, missing), value=1.0), pad(opacities, (0, missing))
     with torch.no_grad():
         shown = renderable(transform_points(camera_from_world, means), scales, opacities, intrinsics, near)
     images, alpha, _ = rasterization(

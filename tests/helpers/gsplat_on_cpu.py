@@ -33,12 +33,17 @@ def _projected(
     means: Tensor, covars: None, quats: Tensor, scales: Tensor, viewmats: Tensor, intrinsics: Tensor, *size: int,
     opacities: Tensor, packed: bool, radius_clip: float, sparse_grad: bool, **options: Any,
 ) -> tuple[Tensor | None, ...]:  # fmt: skip
-    """As the kernel ProjectionEWA3DGSFused: no radius for what is fainter than 1/255."""
+    """As the kernel ProjectionEWA3DGSFused: no radius for what is fainter than 1/255.
+
+    Its backward pass adds up the gradients of poses within a warp of 32 threads, one per Gaussian and view, and gives
+    them all to the first one's view.
+    """
     from gsplat.cuda import _torch_impl
 
     assert covars is None
     assert not packed
     assert radius_clip == 0
+    assert viewmats.shape[:-2].numel() == 1 or means.shape[-2] % 32 == 0, "a warp must not have two views"
     covariance, _ = _torch_impl._quat_scale_to_covar_preci(quats, scales, compute_preci=False)
     radii, *others = _torch_impl._fully_fused_projection(means, covariance, viewmats, intrinsics, *size, **options)
     faint = (opacities < 1 / 255)[..., None, :, None]
