@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from lerobot_msdyn.motion.to_video.kernels import OUTLIER, UNSEEN, Maps, frame_costs
+from lerobot_msdyn.render.cpu.threads import run
 
 SIDE = 40
 GREY = 100
@@ -26,7 +27,9 @@ def wall() -> Maps:
 def cost(maps: Maps, z: float, grey: float = GREY, towards: float = -1.0, x: float = 0.0) -> float:
     points = np.array([[[x, 0.0, z]]], np.float32)
     normals = np.array([[[0.0, 0.0, towards]]], np.float32)
-    return float(frame_costs(points, normals, np.array([grey], np.float32), np.array([0]), maps)[0, 0])
+    costs = np.zeros((1, 1), np.float32)
+    run(frame_costs, 1, points, normals, np.array([grey], np.float32), np.array([0]), maps, costs)
+    return float(costs[0, 0])
 
 
 def test_a_point_on_the_surface_costs_nothing(wall: Maps) -> None:

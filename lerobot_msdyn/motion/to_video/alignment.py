@@ -13,6 +13,7 @@ from lerobot_msdyn.core.geometry import invert_se3, transform_points, unproject
 from lerobot_msdyn.core.sampling import evenly, scaled_px, scaled_window
 from lerobot_msdyn.motion.from_tracks.lift import near_depth_edge
 from lerobot_msdyn.motion.to_video.kernels import OUTSIDE_UNIT, REACH_PX, Maps, Points, align_poses, frame_costs
+from lerobot_msdyn.render.cpu.threads import run
 
 _BORDER_PX = 2  # of 320, of the masks, without points
 _STEPS = 2  # of Gauss-Newton
@@ -127,7 +128,9 @@ def align(
     poses = (view @ motions).contiguous().numpy()
     held_poses = (view @ held).contiguous().numpy()
     pixel_m = video.pixel_m
-    align_poses(
+    run(
+        align_poses,
+        len(video),
         poses,
         held_poses,
         1 / (_TRACKS_SIGMA_PX * pixel_m) ** 2,
@@ -177,7 +180,9 @@ def costs_in_camera(
 ) -> Float[Tensor, " n"]:
     """Mean cost of points in the cameras of some frames."""
     arrays = (each.float().contiguous().numpy() for each in (points, normals, grey))
-    return torch.from_numpy(frame_costs(*arrays, frames.numpy(), video.maps)).mean(0)
+    costs = torch.empty(points.shape[:2])
+    run(frame_costs, len(frames), *arrays, frames.numpy(), video.maps, costs.numpy())
+    return costs.mean(0)
 
 
 def _in_camera(

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lerobot_msdyn.core.compiled import compiled, inlined
+from lerobot_msdyn.render.cpu.simd import take_ticket
 
 REACH_PX = 2  # to either side, over which normals are taken, and 1 for gradients
 OUTSIDE_UNIT = 8  # steps per px of the distance outside the masks
@@ -126,13 +127,17 @@ def _compare(maps, t, x, y, z, nx, ny, nz, out):
 
 
 @compiled
-def frame_costs(points, normals, grey, frames, maps):
-    """How badly points fit frames, 0 to 1 each: [f,n] from points and normals [f,n,3] in the camera, grey [n]."""
-    costs = np.full(points.shape[:2], np.float32(UNSEEN))
+def frame_costs(tickets, points, normals, grey, frames, maps, costs):
+    """How badly points fit frames, 0 to 1 each: `costs` [f,n] of points and normals [f,n,3] in the camera, grey [n].
+
+    A ticket is a frame.
+    """
     out = np.zeros(8)
-    for f in range(len(frames)):
+    f = take_ticket(tickets)
+    while f < len(frames):
         t = frames[f]
         for i in range(points.shape[1]):
+            costs[f, i] = UNSEEN
             x, y, z = points[f, i]
             nx, ny, nz = normals[f, i]
             outcome = _compare(maps, t, x, y, z, nx, ny, nz, out)
@@ -148,7 +153,7 @@ def frame_costs(points, normals, grey, frames, maps):
             else:
                 square = 1e6
             costs[f, i] = square / (OUTLIER**2 + square)
-    return costs
+        f = take_ticket(tickets)
 
 
 @inlined
@@ -290,17 +295,18 @@ def _add_hold(hessian, slope, hold, pose, held, middle, unit):
 
 
 @compiled
-def align_poses(poses, held, hold, pivots, reach, points, maps, steps, longest):
-    """Gauss-Newton steps of poses (camera from canonical) [k,t,4,4], float64, in place.
+def align_poses(tickets, poses, held, hold, pivots, reach, points, maps, steps, longest):
+    """Gauss-Newton steps of poses (camera from canonical) [k,t,4,4], float64, in place; a ticket is a frame.
 
     Each is pulled to the pose in `held` (the same shape) with the weight `hold` (1/m^2, of a turn times the part's
     `reach` and of the shift of its pivot). Steps are `longest` (m) at most.
     """
     status, terms = np.zeros(len(points.xyz), np.int64), np.zeros((len(points.xyz), 12))
-    for part in range(poses.shape[0]):
-        first, last = points.first[part], points.first[part + 1]
-        unit = 1 / reach[part]
-        for t in range(poses.shape[1]):
+    t = take_ticket(tickets)
+    while t < poses.shape[1]:
+        for part in range(poses.shape[0]):
+            first, last = points.first[part], points.first[part + 1]
+            unit = 1 / reach[part]
             pose = poses[part, t]
             for _ in range(steps):
                 mean = _look(points, first, last, pose, maps, t, status, terms)
@@ -318,3 +324,4 @@ def align_poses(poses, held, hold, pivots, reach, points, maps, steps, longest):
                 rotation = _turned(pose[:3, :3], step[:3] * unit)
                 pose[:3, :3] = rotation
                 pose[:3, 3] = pivot + step[3:] - _placed(rotation, pivots[part])
+        t = take_ticket(tickets)
