@@ -77,8 +77,10 @@ def add_level(
             judges = fold == k
             gains[row, judges] = _gain(uniform, indices[judges], logits[judges], tracks.select(judges), canonical)
     smoothing = _best_smoothing(gains, indices, logits, len(places))
-    fitted = level(solved(torch.ones_like(fold, dtype=torch.bool)), smoothing)
-    if config.gate:
+    everywhere = torch.ones_like(fold, dtype=torch.bool)
+    if not config.gate:
+        fitted = level(solved(everywhere), smoothing)
+    else:
         error, gain = torch.zeros(2, len(fold))
 
         def judged(k: int) -> tuple[Float[Tensor, " m"], Float[Tensor, " m"]]:
@@ -86,10 +88,15 @@ def add_level(
 
         for k, values in enumerate(in_threads(judged, range(_FOLDS))):
             error[fold == k], gain[fold == k] = values
-        kept = torch.zeros(len(fitted), dtype=torch.bool)
         proven = _proven(error, gain, tracks.part, _VISIBLE_PX * seen.pixel_m)
-        if approve is not None and bool(proven.any()):
+        if not bool(proven.any()):  # as most often
+            still = torch.eye(4, dtype=torch.float64).expand(len(places), tracks.positions.shape[1], 4, 4)
+            idle = level(still, torch.full((len(places),), torch.inf))
+            return replace(idle, active=torch.zeros_like(idle.active)), replace(tracks, owner=owner)
+        fitted = level(solved(everywhere), smoothing)
+        if approve is not None:
             proven &= approve(fitted)[: len(proven)]
+        kept = torch.zeros(len(fitted), dtype=torch.bool)
         kept[owner[proven[tracks.part]]] = True
         coarser = so_far.levels[-1]
         if spec.refines and isinstance(coarser, MotionLevel):

@@ -16,6 +16,8 @@ _ROUNDS = 3  # of robust weights, each track following one basis
 _SWEEPS = 8  # in which all bases are adapted to their blend
 _NORMAL_MAD = 1.4826  # standard deviations in the median absolute deviation of a normal distribution
 _MEDIAN_NORM = 1.538  # standard deviations in the median length of a normal 3D vector
+_PAIRS = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)  # of axes: the entries of a symmetric matrix ...
+_OF_PAIRS = ((0, 1, 2), (1, 3, 4), (2, 4, 5))  # ... and which of these stands where
 _HELD = 1e4  # weight of the identity at the canonical frame, against 1 for any other frame
 _INVERTIBLE = 0.3  # smallest singular value of a blend that is inverted
 
@@ -169,18 +171,15 @@ def _procrustes(
     """
     n, frames = weights.shape
     count = follows.shape[1]
-
-    def sums(values: Float[Tensor, "n t c"]) -> Float[Tensor, "k t c"]:
-        return (follows.T @ values.flatten(1)).reshape(count, frames, values.shape[2])
-
-    xs = x[:, None].expand(n, frames, 3)
-    weight = weights[..., None]
-    total = sums(weight)
+    at = follows[..., None] * x[:, None]  # [n,k,3]
+    twice = at[..., _PAIRS[0]] * x[:, None, _PAIRS[1]]  # [n,k,6]
+    moments = torch.cat((follows[..., None], at, twice), dim=-1).flatten(1).T @ weights
+    total, x_mean, xx = moments.reshape(count, -1, frames).transpose(1, 2).split((1, 3, 6), dim=-1)
     safe = total.clamp(min=1e-12)
-    x_mean = sums(weight * xs) / safe
-    xx = sums(weight * (x[:, :, None] * x[:, None, :]).reshape(n, 1, 9)).reshape(count, frames, 3, 3) / safe[..., None]
-    miss_mean = sums(weight * miss) / safe
-    miss_x = sums(weight * (miss[..., :, None] * xs[..., None, :]).flatten(2)).reshape(xx.shape) / safe[..., None]
+    x_mean, xx = x_mean / safe, (xx / safe)[..., _OF_PAIRS]
+    missed = torch.cat((follows[..., None], at), dim=-1).flatten(1).T @ (weights[..., None] * miss).flatten(1)
+    missed = missed.reshape(count, 4, frames, 3).permute(0, 2, 3, 1) / safe[..., None]
+    miss_mean, miss_x = missed[..., 0], missed[..., 1:]
 
     old, shift = motions[..., :3, :3], motions[..., :3, 3]
     y_mean = (old @ x_mean[..., None])[..., 0] + shift + miss_mean
@@ -208,10 +207,15 @@ def _typical(
 def _nearest_solved(motions: Float[Tensor, "k t 4 4"], solved: Bool[Tensor, "k t"]) -> Float[Tensor, "k t 4 4"]:
     """Every frame that was not solved copies the nearest one that was; a basis without any does not move."""
     time = torch.arange(motions.shape[1])
-    apart = (time[:, None] - time).abs().expand(len(motions), -1, -1)
-    nearest = torch.where(solved[:, None], apart, 10**9).argmin(-1)
-    copied = motions.gather(1, nearest[..., None, None].expand(-1, -1, 4, 4))
-    return torch.where(solved.any(1)[:, None, None, None], copied, torch.eye(4, dtype=motions.dtype))
+    apart = (time[:, None] - time).abs()
+    filled = motions.clone()
+    for k in (~solved.all(1)).nonzero()[:, 0].tolist():
+        known = solved[k].nonzero()[:, 0]
+        if len(known):
+            filled[k] = motions[k, known[apart[:, known].argmin(1)]]
+        else:
+            filled[k] = torch.eye(4, dtype=motions.dtype)
+    return filled
 
 
 def whittaker(
