@@ -1,10 +1,12 @@
 """A scene of a static and a moving set of Gaussians, and what it holds at a time."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from lerobot_msdyn.core.serialise import named_tensors
 from lerobot_msdyn.motion.model.compose import Level, compose, compose_points
@@ -21,8 +23,8 @@ class Snapshot:
 
     means: Float[Tensor, "b g 3"]
     quats: Float[Tensor, "b g 4"]
-    scales: Float[Tensor, "g 3"]
-    opacities: Float[Tensor, " g"]
+    scales: Float[Tensor, "*#b g 3"]
+    opacities: Float[Tensor, "*#b g"]
     rgb: Float[Tensor, "b g 3"]
     moving: Float[Tensor, " g"]  # 1 for the moving set, 0 for the static one
     extra: Float[Tensor, " g"] | None = None  # another value of each
@@ -38,6 +40,31 @@ def patched(snapshot: Snapshot, patch: FramePatch) -> Snapshot:
         scales=torch.cat((snapshot.scales, patch.log_scales.exp())),
         opacities=torch.cat((left, PATCH_OPACITY * ones)),
         rgb=torch.cat((snapshot.rgb, patch.rgb[None]), dim=1),
+        moving=torch.cat((snapshot.moving, ones)),
+        extra=None if snapshot.extra is None else torch.cat((snapshot.extra, ones)),
+    )
+
+
+def patched_together(snapshot: Snapshot, patches: Sequence[FramePatch]) -> Snapshot:
+    """A snapshot of some frames, each with its patch as in `patched`; shorter ones are filled up with what is not seen.
+
+    For devices that many small calls keep waiting: it takes more memory than the frames one by one.
+    """
+    b, g = len(patches), snapshot.means.shape[1]
+    means, quats, log_scales, rgb = (
+        pad_sequence([getattr(patch, name) for patch in patches], batch_first=True)
+        for name in ("means", "quats", "log_scales", "rgb")
+    )
+    lengths = torch.tensor([len(patch) for patch in patches], device=means.device)[:, None]
+    shown = torch.arange(means.shape[1], device=means.device) < lengths
+    left = torch.where(torch.stack([patch.hidden for patch in patches]), 0.0, snapshot.opacities)
+    ones = means.new_ones(means.shape[1])
+    return Snapshot(
+        means=torch.cat((snapshot.means, means), dim=1),
+        quats=torch.cat((snapshot.quats, torch.where(shown[..., None], quats, 1.0)), dim=1),
+        scales=torch.cat((snapshot.scales.expand(b, g, 3), log_scales.exp()), dim=1),
+        opacities=torch.cat((left, PATCH_OPACITY * shown), dim=1),
+        rgb=torch.cat((snapshot.rgb, rgb), dim=1),
         moving=torch.cat((snapshot.moving, ones)),
         extra=None if snapshot.extra is None else torch.cat((snapshot.extra, ones)),
     )

@@ -1,6 +1,6 @@
 """Pictures of a dynamic scene: frames from a camera track."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 
 import torch
@@ -11,7 +11,7 @@ from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.render import Raster, rasterize
 from lerobot_msdyn.render.cpu.threads import torch_on_one_thread
-from lerobot_msdyn.scene.dynamic import DynamicScene, Snapshot, patched
+from lerobot_msdyn.scene.dynamic import DynamicScene, Snapshot, patched, patched_together
 from lerobot_msdyn.scene.overlay import FramePatch
 
 _FAINT = 1e-6  # opacity by which nothing is divided
@@ -43,10 +43,12 @@ def render_scene(
     if scene.overlay is None and scene.short_lived is None:
         camera, frames = to_device((camera, frames), scene.device)
         return render_snapshot(_snapshot(scene, camera, frames, extra), camera, scene.near, backend)
+    patches = [patch for frame in frames.tolist() if (patch := scene.patch(frame)) is not None]
+    if scene.device.type != "cpu":
+        return render_patched_together(scene, camera, frames, patches, backend, extra)
     parts = [
         render_patched(scene, camera.select([i]), frame, patch, backend, extra)
-        for i, frame in enumerate(frames.tolist())
-        if (patch := scene.patch(frame)) is not None
+        for i, (frame, patch) in enumerate(zip(frames.tolist(), patches, strict=True))
     ]
     if len(parts) == 1:
         return parts[0]
@@ -65,6 +67,20 @@ def render_patched(
     """The scene at one frame through one pose, with a patch in place of what the patch hides."""
     camera, when, patch = to_device((camera, torch.tensor([frame]), patch), scene.device)
     return render_snapshot(patched(_snapshot(scene, camera, when, extra), patch), camera, scene.near, backend)
+
+
+def render_patched_together(
+    scene: DynamicScene,
+    camera: CameraTrack,
+    frames: Tensor,
+    patches: Sequence[FramePatch],
+    backend: str = "auto",
+    extra: Float[Tensor, " m"] | None = None,
+) -> Rendering:
+    """As `render_patched`, some frames at once, each through its pose and with its patch."""
+    camera, when = to_device((camera, frames), scene.device)
+    snapshot = patched_together(_snapshot(scene, camera, when, extra), patches)
+    return render_snapshot(snapshot, camera, scene.near, backend)
 
 
 def _snapshot(scene: DynamicScene, camera: CameraTrack, frames: Tensor, extra: Float[Tensor, " m"] | None) -> Snapshot:

@@ -58,16 +58,16 @@ def coverage_of(
     device = rendering.depth.device
     holds = camera.is_static and device.type == "cpu"  # elsewhere to look for what differs costs more than it spares
     camera = to_device(camera, device)
-    coverages: list[Coverage] = []
+    shown, holes = [], []
     for i, (depth, alpha) in enumerate(zip(rendering.depth, rendering.alpha, strict=True)):
         before = looked(depth, camera.select([i]), evidence, before if holds else None)
         moving = rendering.moving[i] > 0.5 * alpha
         frames_moving = (rendering.extra[i] / rendering.moving[i].clamp(min=1e-6)).round().long()
         empty = alpha < HOLE_ALPHA
-        frames = torch.where(moving, frames_moving, before.still).masked_fill(empty, 0)
-        on_host = to_device((frames == 0, frames, empty), "cpu")
-        coverages.append(Coverage(*(values.numpy() for values in on_host)))
-    return coverages
+        shown.append(torch.where(moving, frames_moving, before.still).masked_fill(empty, 0))
+        holes.append(empty)
+    on_host = (values.numpy() for values in to_device((torch.stack(shown), torch.stack(holes)), "cpu"))
+    return [Coverage(frames == 0, frames, empty) for frames, empty in zip(*on_host, strict=True)]
 
 
 def looked(depth: Float[Tensor, "h w"], pose: CameraTrack, evidence: Evidence, before: Looked | None = None) -> Looked:

@@ -24,6 +24,7 @@ logger = logging.getLogger(__name__)
 
 BATCH = 4  # frames that are rendered at a time ...
 PIXELS_AT_ONCE = BATCH * 320 * 240  # ... as far as a thread of the CPU has room for them in its cache
+GPU_BATCH = 16  # on a GPU, where launching kernels takes longer than running them
 Rendered = tuple[Rendering, list[Coverage], Float[Tensor, "#t #h #w 3"]]  # frames, their coverage, what fills holes
 
 
@@ -125,7 +126,7 @@ def _rendered[T](
         still = _still(window, poses, times, fill) if poses.is_static else None
         some = functools.partial(_some_made, made, window, poses, times, fill, still)
         on_cpu = window.scene.device.type == "cpu"
-        size = min(BATCH, max(1, PIXELS_AT_ONCE // (camera.width * camera.height))) if on_cpu else BATCH
+        size = min(BATCH, max(1, PIXELS_AT_ONCE // (camera.width * camera.height))) if on_cpu else GPU_BATCH
         batches = [slice(start, min(start + size, len(times))) for start in range(0, len(times), size)]
         yield from in_threads(some, batches) if on_cpu else map(some, batches)
 
@@ -141,7 +142,8 @@ def _some_made[T](
 ) -> T:
     """What is made of a batch of a window's frames."""
     poses = camera.select(batch)
-    rendering = next(render_frames(window.scene, poses, times[batch], extra=window.evidence.moving_frames))
+    every = window.evidence.moving_frames
+    rendering = next(render_frames(window.scene, poses, times[batch], batch=len(poses), extra=every))
     if fill == "none":
         behind = rendering.rgb.new_zeros(1, 1, 1, 3)
     elif still is None or still.filling is None:

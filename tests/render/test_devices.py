@@ -28,7 +28,7 @@ from lerobot_msdyn.reconstruction.self_check import self_check
 from lerobot_msdyn.scene import rendering
 from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.views.gate import judge
-from lerobot_msdyn.views.pictures import BATCH, coverages, new_pictures, on_device
+from lerobot_msdyn.views.pictures import GPU_BATCH, coverages, new_pictures, on_device
 
 pytestmark = pytest.mark.slow
 
@@ -130,8 +130,8 @@ def test_what_is_made_of_a_fit(gpu: FakeGpu) -> None:
     waits.pop("scene/short_lived.py _first")
     patches = {"scene/dynamic.py patch": FRAMES}
     assert waits == patches | {"motion/model/bases.py _moves": 1, "motion/model/bases.py _at_frames": 2}
-    batches = -(-FRAMES // BATCH)
-    assert copies == {"core/serialise.py to_device": 3 * FRAMES + 2 * batches}  # coverage; pictures and depth
+    batches = -(-FRAMES // GPU_BATCH)
+    assert copies == {"core/serialise.py to_device": 4 * batches}  # coverage and holes, pictures and depth
 
 
 def test_values_keep_their_structure() -> None:

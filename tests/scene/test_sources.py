@@ -10,6 +10,7 @@ from lerobot_msdyn.motion.model.bases import identity_level
 from lerobot_msdyn.reconstruction.background import background_gaussians, pixel_gaussians
 from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.overlay import FramePatch, packed
+from lerobot_msdyn.scene.rendering import render_patched_together, render_scene
 from lerobot_msdyn.scene.sources import MovingPixels, moving_pixels_of_view, sources_of
 from lerobot_msdyn.views.offsets import orbit_offset
 
@@ -48,6 +49,15 @@ def scene(camera: CameraTrack) -> DynamicScene:
     rows = torch.zeros(len(moving), 1)
     level = identity_level(torch.zeros(1, 3), FRAMES)
     return DynamicScene(static, moving, (level,), (rows.long(),), (rows,), FRAMES, overlay=packed(patches))
+
+
+def test_frames_rendered_together_look_as_one_by_one(scene: DynamicScene, camera: CameraTrack) -> None:
+    frames, extra = torch.arange(FRAMES), torch.linspace(1, 5, len(scene.moving))
+    patches = [patch for frame in range(FRAMES) if (patch := scene.patch(frame)) is not None]
+    assert len({len(patch) for patch in patches}) == FRAMES
+    together = render_patched_together(scene, camera, frames, patches, extra=extra)
+    for name, values in vars(render_scene(scene, camera, frames, extra=extra)).items():
+        torch.testing.assert_close(getattr(together, name), values, atol=1e-5, rtol=1e-5)
 
 
 def test_every_pixel_knows_what_renders_it(scene: DynamicScene, camera: CameraTrack) -> None:
