@@ -97,6 +97,7 @@ def test_orbit_turns_further_where_the_scale_is_metric_unless_told_how_far() -> 
 
     assert 12 < largest(Orbit(), metric=True) <= 15
     assert 8 < largest(Orbit(), metric=False) <= 10
+    assert 4 < largest(Orbit(azimuth_guessed_deg=5.0), metric=False) <= 5
     for metric in (True, False):
         assert 3.2 < largest(Orbit(azimuth_deg=4.0), metric=metric) <= 4
 

@@ -6,8 +6,7 @@ from typing import ClassVar
 from lerobot_msdyn.core.fields import between
 from lerobot_msdyn.core.perturbation import Perturbation, Viewpoint
 
-METRIC_AZIMUTH_DEG = 15.0  # by which policies gain most where depth is measured, or held to a robot's joints ...
-GUESSED_AZIMUTH_DEG = 10.0  # ... and where it is a guess (docs/results.md)
+METRIC_AZIMUTH_DEG = 15.0  # within which policies gain most by a robot's joints (docs/results.md)
 
 
 @Perturbation.register_subclass("orbit")
@@ -17,8 +16,10 @@ class Orbit(Perturbation):
 
     moves_rig: ClassVar[bool] = True
 
-    # Largest turn to either side, about the vertical, in degrees. Default: 15 where the scale is metric, 10 elsewhere.
+    # Largest turn to either side, about the vertical, in degrees; null: 15 where the scale is metric, ...
     azimuth_deg: float | None = between(None, 0, 90)
+    # ... and this where it is not.
+    azimuth_guessed_deg: float = between(10.0, 0, 90)
     # Largest turn up or down, about the horizontal, in degrees.
     elevation_deg: float = between(5.0, 0, 60)
     # Largest shift along each of the camera's axes in metres, where the scale is metric.
@@ -30,6 +31,6 @@ class Orbit(Perturbation):
         """Both angles, and a shift along all axes."""
         azimuth = self.azimuth_deg
         if azimuth is None:
-            azimuth = METRIC_AZIMUTH_DEG if view.metric else GUESSED_AZIMUTH_DEG
+            azimuth = METRIC_AZIMUTH_DEG if view.metric else self.azimuth_guessed_deg
         angles = {"azimuth_deg": azimuth, "elevation_deg": self.elevation_deg}
         return angles | view.shifts(self.translation_m, self.translation_rel)
