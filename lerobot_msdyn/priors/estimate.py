@@ -65,7 +65,7 @@ def estimate_priors(
     pinhole, camera_from = _camera(request, instances)
     robot = 0
     if view.robot is not None:
-        instances, robot = with_robot(instances, view.robot)
+        instances, robot = with_robot(instances, view.robot, view.rgb)
     posed = replace(request, view=replace(view, camera=pinhole))
     depth, depth_from = provide(
         DepthProvider, config.depth, posed, lambda provider: provider.estimate(posed, instances), file=DepthFile
@@ -109,7 +109,7 @@ def estimate_masks(
     """The masks of `estimate_priors` alone (0 = nothing moves), which finds the provider's in the cache afterwards."""
     cache, networks_on = open_cache(config.cache, view.rgb), chosen_device(device, networks=True).type
     instances = _masks(Request(view, config, camera, cache, (), elsewhere, episode, key, networks_on))[0]
-    return instances if view.robot is None else with_robot(instances, view.robot)[0]
+    return instances if view.robot is None else with_robot(instances, view.robot, view.rgb)[0]
 
 
 def known_camera(

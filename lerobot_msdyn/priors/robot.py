@@ -11,6 +11,7 @@ from torch import Tensor
 
 from lerobot_msdyn.core.observations import RobotSeen
 from lerobot_msdyn.core.sampling import scaled_px
+from lerobot_msdyn.priors.masks.before_links import shown_before
 from lerobot_msdyn.priors.registry import Depth, Masks
 
 RELATIVE_ERROR = 0.03  # of depth by a calibrated robot
@@ -18,15 +19,16 @@ BESIDE_PX = 4.0  # of 320: so far from the robot's pixels a mask may still be th
 SAME_DEPTH = 0.05  # share by which a thing and the link that touches it may differ
 TOUCHING_PX = 1.5  # of 320: no farther apart are things that touch
 LEAST_TOUCHED = 8  # pixels
+MOVED = 0.1  # share of a thing's pixels that are outside of where it was, if it has moved
 LEAST_PX = 6.0  # of 320: side of the smallest thing that touches the robot
 
 
-def with_robot(instances: Masks, robot: RobotSeen) -> tuple[Masks, int]:
+def with_robot(instances: Masks, robot: RobotSeen, rgb: UInt8[Tensor, "t h w 3"]) -> tuple[Masks, int]:
     """Instances of which one is the robot, and its id (0 where none of it moves).
 
-    All pixels of moving links are its. It is the instance that covers most of them; what else that instance covers,
-    farther from the robot than masks err, is another thing that touches the robot: the one that covers the same pixels
-    in the frame before or after, else one of its own.
+    All pixels of moving links are its, but for those that show by their colours what it holds before them. It is the
+    instance that covers most of them; what else that instance covers, farther from the robot than masks err, is another
+    thing that touches the robot: the one that covers the same pixels in the frame before or after, else one of its own.
     """
     moving = robot.moving
     if not bool(moving.any()):
@@ -36,8 +38,9 @@ def with_robot(instances: Masks, robot: RobotSeen) -> tuple[Masks, int]:
     label = int(shares.argmax()) if bool(shares.any()) else min(int(instances.max()) + 1, 255)
     its = instances == label
     others = torch.from_numpy(_others(torch.where(its, 0, instances).numpy(), _touching(its, robot), label))
-    beside = its & (others == 0) & (robot.depth == 0)  # links that rest are not among what moves
-    return torch.where(moving | beside, torch.tensor(label, dtype=torch.uint8), others), label
+    things = torch.from_numpy(shown_before(rgb.numpy(), moving.numpy(), others.numpy()))
+    own = (things == 0) & (moving | (its & (robot.depth == 0)))  # links that rest are not among what moves
+    return torch.where(own, torch.tensor(label, dtype=torch.uint8), things), label
 
 
 def with_robot_depth(depth: Depth, instances: Masks, robot: RobotSeen, label: int) -> Depth:
@@ -45,7 +48,7 @@ def with_robot_depth(depth: Depth, instances: Masks, robot: RobotSeen, label: in
 
     What else of the robot's mask lies beside its pixels has the depth of the nearest of them. Another instance that
     touches a link that moves is as far away as that link where they touch, since it may be held above the table; one
-    that lies on the ground stays there.
+    that lies on the ground stays there, and so does one behind the robot that is where it was without.
 
     Args:
         depth: by others.
@@ -55,14 +58,33 @@ def with_robot_depth(depth: Depth, instances: Masks, robot: RobotSeen, label: in
     """
     if depth.traits.metric and depth.traits.measured:
         return depth
-    z, lying = [], torch.tensor(sorted(depth.lying), dtype=torch.uint8)
-    for known, ids, moving, other in zip(robot.depth, instances, robot.moving, depth.z, strict=True):
+    z, staying = [], _resting(instances, robot.moving & (instances == label))
+    staying |= torch.isin(instances, torch.tensor(sorted(depth.lying), dtype=torch.uint8))
+    for known, ids, moving, other, stays in zip(robot.depth, instances, robot.moving, depth.z, staying, strict=True):
         its = (ids == label) & (ids > 0)
         own = _spread(known, its)
-        free = torch.where(its | torch.isin(ids, lying), 0, ids)
+        free = torch.where(its | stays, 0, ids)
         held = _held(free, torch.where(moving, known, 0.0), other)
         z.append(torch.where(own > 0, own, held))
     return replace(depth, z=torch.stack(z))
+
+
+def _resting(instances: Masks, links: Bool[Tensor, "t h w"]) -> Bool[Tensor, "t h w"]:
+    """Pixels of things that are where they were in the last or the next frame in which no link touched them."""
+    resting = torch.zeros_like(links)
+    beside = torch.stack([with_touching(one) for one in links])
+    for index in instances.unique().tolist():
+        its = instances == index
+        if not index or bool((its & links).any()):  # the robot
+            continue
+        size = its.sum((1, 2))
+        alone = ((size > 0) & ((its & beside).sum((1, 2)) < LEAST_TOUCHED)).nonzero()[:, 0]
+        for t in size.nonzero()[:, 0].tolist():
+            for other in (*alone[alone <= t][-1:].tolist(), *alone[alone >= t][:1].tolist()):
+                moved = its[t] & ~with_touching(its[other])
+                if moved.sum() <= MOVED * size[t]:
+                    resting[t] |= its[t]
+    return resting
 
 
 def _held(

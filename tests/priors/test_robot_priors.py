@@ -7,6 +7,7 @@ from lerobot_msdyn.priors.registry import Depth
 from lerobot_msdyn.priors.robot import with_robot, with_robot_depth
 
 FRAMES, HEIGHT, WIDTH = 3, 60, 80
+GREY = torch.full((FRAMES, HEIGHT, WIDTH, 3), 90, dtype=torch.uint8)
 ARM, BASE = (slice(5, 40), slice(30, 40)), (slice(40, 55), slice(25, 45))
 
 
@@ -29,7 +30,7 @@ def masks() -> torch.Tensor:
 
 
 def test_the_robot_is_one_instance_without_what_it_touches() -> None:
-    found, label = with_robot(masks(), robot())
+    found, label = with_robot(masks(), robot(), GREY)
     assert label == 2
     assert bool((found[:, *ARM] == 2).all())
     assert bool((found[:, 5:40, 29] == 2).all())
@@ -43,7 +44,7 @@ def test_what_touches_the_robot_keeps_its_id() -> None:
     seen = masks()
     seen[0, 10:20, 50:60], seen[0, 10:20, 60:70] = 1, 0
     seen[1] = seen[2]
-    found, _ = with_robot(seen, robot())
+    found, _ = with_robot(seen, robot(), GREY)
     assert set(found[1, 10:20, 46:58].unique().tolist()) == {1}
     assert set(found[2, 10:20, 46:58].unique().tolist()) == {1}
 
@@ -51,14 +52,14 @@ def test_what_touches_the_robot_keeps_its_id() -> None:
 def test_a_robot_that_rests_changes_nothing() -> None:
     still = robot()
     still.moving[:] = False
-    found, label = with_robot(masks(), still)
+    found, label = with_robot(masks(), still, GREY)
     assert label == 0
     assert torch.equal(found, masks())
 
 
 def test_depth_of_the_robot_and_of_what_it_holds() -> None:
     plane = torch.full((FRAMES, HEIGHT, WIDTH), 3.0)
-    found, label = with_robot(masks(), robot())
+    found, label = with_robot(masks(), robot(), GREY)
     z = with_robot_depth(Depth(plane, DepthTraits()), found, robot(), label).z
     assert bool((z[:, *ARM] == 1).all())
     assert bool((z[:, *BASE] == 1.2).all())
@@ -72,3 +73,24 @@ def test_depth_of_the_robot_and_of_what_it_holds() -> None:
     assert bool((near[2, 10:20, 46:58] == plane[0, 0, 0] / 2.9).all())
     measured = Depth(plane, DepthTraits(metric=True, sharp=True))
     assert torch.equal(with_robot_depth(measured, found, robot(), label).z, plane)
+
+
+def test_what_is_behind_the_robot_and_has_not_moved_is_not_held() -> None:
+    plane = torch.full((FRAMES, HEIGHT, WIDTH), 3.0)
+    seen = torch.zeros(FRAMES, HEIGHT, WIDTH, dtype=torch.uint8)
+    seen[:, *ARM], seen[:, 10:20, 40:50] = 2, 1
+    arm = robot()
+    found, label = with_robot(seen, arm, GREY)
+    assert float(with_robot_depth(Depth(plane, DepthTraits()), found, arm, label).z[0, 15, 45]) == 1, (
+        "held all the time"
+    )
+    arm.moving[1, 5:25] = False  # the arm has let go, or had not yet come
+    seen[1, 5:25, 30:40] = 0
+    found, label = with_robot(seen, arm, GREY)
+    z = with_robot_depth(Depth(plane, DepthTraits()), found, arm, label).z
+    assert bool((z[:, 10:20, 40:50] == 3).all())
+    seen[2, 10:20, 40:50], seen[2, 6:16, 40:50] = 0, 1
+    found, label = with_robot(seen, arm, GREY)
+    z = with_robot_depth(Depth(plane, DepthTraits()), found, arm, label).z
+    assert float(z[0, 15, 45]) == 3
+    assert float(z[2, 8, 45]) == 1, "lifted"

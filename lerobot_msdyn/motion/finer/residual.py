@@ -169,8 +169,7 @@ def _procrustes(
     A rotation has the prior of a small turn (standard deviation _USUAL_TURN about each axis): to the second moment is
     added sigma^2 / (n turn^2) times the identity, sigma (m) being the noise along one axis and n the points behind it.
     """
-    n, frames = weights.shape
-    count = follows.shape[1]
+    count, frames = follows.shape[1], weights.shape[1]
     at = follows[..., None] * x[:, None]  # [n,k,3]
     twice = at[..., _PAIRS[0]] * x[:, None, _PAIRS[1]]  # [n,k,6]
     moments = torch.cat((follows[..., None], at, twice), dim=-1).flatten(1).T @ weights
