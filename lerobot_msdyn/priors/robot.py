@@ -70,7 +70,10 @@ def with_robot_depth(depth: Depth, instances: Masks, robot: RobotSeen, label: in
 
 
 def _resting(instances: Masks, links: Bool[Tensor, "t h w"]) -> Bool[Tensor, "t h w"]:
-    """Pixels of things that are where they were in the last or the next frame in which no link touched them."""
+    """Pixels of things that are where they were in the last or the next frame in which no link touched them.
+
+    In a frame before and after that frame none must have touched them either: masks of what is held can miss a link.
+    """
     resting = torch.zeros_like(links)
     beside = torch.stack([with_touching(one) for one in links])
     for index in instances.unique().tolist():
@@ -78,7 +81,8 @@ def _resting(instances: Masks, links: Bool[Tensor, "t h w"]) -> Bool[Tensor, "t 
         if not index or bool((its & links).any()):  # the robot
             continue
         size = its.sum((1, 2))
-        alone = ((size > 0) & ((its & beside).sum((1, 2)) < LEAST_TOUCHED)).nonzero()[:, 0]
+        free = (size > 0) & ((its & beside).sum((1, 2)) < LEAST_TOUCHED)
+        alone = (free & torch.cat((free[:1], free[:-1])) & torch.cat((free[1:], free[-1:]))).nonzero()[:, 0]
         for t in size.nonzero()[:, 0].tolist():
             for other in (*alone[alone <= t][-1:].tolist(), *alone[alone >= t][:1].tolist()):
                 moved = its[t] & ~with_touching(its[other])

@@ -84,8 +84,10 @@ def test_what_is_behind_the_robot_and_has_not_moved_is_not_held() -> None:
     assert float(with_robot_depth(Depth(plane, DepthTraits()), found, arm, label).z[0, 15, 45]) == 1, (
         "held all the time"
     )
-    arm.moving[1, 5:25] = False  # the arm has let go, or had not yet come
-    seen[1, 5:25, 30:40] = 0
+    arm.moving[1, 5:25], seen[1, 5:25, 30:40] = False, 0
+    found, label = with_robot(seen, arm, GREY)
+    assert float(with_robot_depth(Depth(plane, DepthTraits()), found, arm, label).z[2, 15, 45]) == 1, "for a frame only"
+    arm.moving[0, 5:25], seen[0, 5:25, 30:40] = False, 0  # the arm has not come yet
     found, label = with_robot(seen, arm, GREY)
     z = with_robot_depth(Depth(plane, DepthTraits()), found, arm, label).z
     assert bool((z[:, 10:20, 40:50] == 3).all())
