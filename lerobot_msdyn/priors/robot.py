@@ -17,6 +17,7 @@ from lerobot_msdyn.priors.registry import Depth, Masks
 RELATIVE_ERROR = 0.03  # of depth by a calibrated robot
 BESIDE_PX = 4.0  # of 320: so far from the robot's pixels a mask may still be the robot's
 SAME_DEPTH = 0.05  # share by which a thing and the link that touches it may differ
+BEFORE = 0.08  # share by which a link must be nearer than a thing that rests, to be before it and not to hold it
 TOUCHING_PX = 1.5  # of 320: no farther apart are things that touch
 LEAST_TOUCHED = 8  # pixels
 MOVED = 0.1  # share of a thing's pixels that are outside of where it was, if it has moved
@@ -58,13 +59,13 @@ def with_robot_depth(depth: Depth, instances: Masks, robot: RobotSeen, label: in
     """
     if depth.traits.metric and depth.traits.measured:
         return depth
-    z, staying = [], _resting(instances, robot.moving & (instances == label))
-    staying |= torch.isin(instances, torch.tensor(sorted(depth.lying), dtype=torch.uint8))
-    for known, ids, moving, other, stays in zip(robot.depth, instances, robot.moving, depth.z, staying, strict=True):
+    z, resting = [], _resting(instances, robot.moving & (instances == label))
+    lying = torch.tensor(sorted(depth.lying), dtype=torch.uint8)
+    for known, ids, moving, other, rests in zip(robot.depth, instances, robot.moving, depth.z, resting, strict=True):
         its = (ids == label) & (ids > 0)
         own = _spread(known, its)
-        free = torch.where(its | stays, 0, ids)
-        held = _held(free, torch.where(moving, known, 0.0), other)
+        free = torch.where(its | torch.isin(ids, lying), 0, ids)
+        held = _held(free, torch.where(moving, known, 0.0), other, rests)
         z.append(torch.where(own > 0, own, held))
     return replace(depth, z=torch.stack(z))
 
@@ -92,11 +93,11 @@ def _resting(instances: Masks, links: Bool[Tensor, "t h w"]) -> Bool[Tensor, "t 
 
 
 def _held(
-    others: UInt8[Tensor, "h w"], links: Float[Tensor, "h w"], depth: Float[Tensor, "h w"]
+    others: UInt8[Tensor, "h w"], links: Float[Tensor, "h w"], depth: Float[Tensor, "h w"], rests: Bool[Tensor, "h w"]
 ) -> Float[Tensor, "h w"]:
     """Depth (m) in which instances that touch links (m, 0 = none) are as far away as these where they touch them.
 
-    What is about as far away already stays where it is: it may stand on the table.
+    What is about as far away already stays where it is: it may stand on the table. So does what rests far behind.
     """
     for index in others.unique().tolist():
         its = others == index
@@ -108,7 +109,8 @@ def _held(
             depth = torch.where(its, touched.median(), depth)
             continue
         factor = touched.median() / depth[beside].median()
-        if abs(float(factor.log())) > SAME_DEPTH:
+        behind = -float(factor.log())
+        if abs(behind) > SAME_DEPTH and not (behind > BEFORE and bool(rests[its].any())):
             depth = torch.where(its, factor * depth, depth)
     return depth
 

@@ -1,7 +1,7 @@
 """Depth without a sensor or learned weights: everything stands on a table."""
 
 from lerobot_msdyn.core.observations import DepthTraits
-from lerobot_msdyn.priors.depth.table_plane import ground_plane, table_plane, with_standing
+from lerobot_msdyn.priors.depth.table_plane import ground_plane, table_plane, upright, with_standing
 from lerobot_msdyn.priors.depth.uprights import empty_scene, still_error
 from lerobot_msdyn.priors.registry import DEPTH, Depth, DepthProvider, Estimate, Masks
 from lerobot_msdyn.priors.request import Request
@@ -34,4 +34,7 @@ class Plane(DepthProvider):
             ground = table_plane(width, height, view.camera.intrinsics[0], height_m, tilt_deg)
             traits = DepthTraits(sharp=True, relative_error=0.10, assumed=True)
             how = f"a table seen from {height_m:g} m at {tilt_deg:g} degrees"
-        return Estimate(Depth(with_standing(ground, instances, empty), traits, ground), how)
+        depth = with_standing(ground, instances, empty)
+        if view.robot is not None and view.camera.is_static:
+            depth = upright(depth, instances, view.camera, view.robot.ground_m)
+        return Estimate(Depth(depth, traits, ground), how)
