@@ -1,5 +1,6 @@
 """What the joints say of masks and depth: the robot's pixels, what rests, and what it touches."""
 
+import pytest
 import torch
 
 from lerobot_msdyn.core.observations import BodyTracks, DepthTraits, RobotSeen
@@ -96,3 +97,15 @@ def test_what_is_behind_the_robot_and_has_not_moved_is_not_held() -> None:
     z = with_robot_depth(Depth(plane, DepthTraits()), found, arm, label).z
     assert float(z[0, 15, 45]) == 3
     assert float(z[2, 8, 45]) == 1, "lifted"
+
+
+@pytest.mark.parametrize(("width", "rests"), [(6, True), (12, False)])
+def test_a_wide_thing_that_is_little_farther_is_as_far_as_what_touches_it(width: int, rests: bool) -> None:
+    plane = torch.full((FRAMES, HEIGHT, WIDTH), 1.06)
+    seen = torch.zeros(FRAMES, HEIGHT, WIDTH, dtype=torch.uint8)
+    seen[:, *ARM], seen[:, 10:20, 40 : 40 + width] = 2, 1
+    arm = robot()
+    arm.moving[:2, 5:25], seen[:2, 5:25, 30:40] = False, 0
+    found, label = with_robot(seen, arm, GREY)
+    z = with_robot_depth(Depth(plane, DepthTraits()), found, arm, label).z
+    assert float(z[2, 15, 42]) == pytest.approx(1.06 if rests else 1.0)
