@@ -17,8 +17,7 @@ from lerobot_msdyn.priors.registry import Depth, Masks
 RELATIVE_ERROR = 0.03  # of depth by a calibrated robot
 BESIDE_PX = 4.0  # of 320: so far from the robot's pixels a mask may still be the robot's
 SAME_DEPTH = 0.05  # share by which a thing and the link that touches it may differ
-BEFORE = 0.08  # share by which a link must be nearer than a wide thing that rests, to be before it and not to touch it
-SMALL_PX = 30.0  # of 320: the width up to which the depth of a thing that rests is better known than by a touch
+BEFORE = 0.08  # share by which a link must be nearer than a thing that rests, to be before it and not to touch it
 TOUCHING_PX = 1.5  # of 320: no farther apart are things that touch
 LEAST_TOUCHED = 8  # pixels
 MOVED = 0.1  # share of a thing's pixels that are outside of where it was, if it has moved
@@ -98,8 +97,7 @@ def _held(
 ) -> Float[Tensor, "h w"]:
     """Depth (m) in which instances that touch links (m, 0 = none) are as far away as these where they touch them.
 
-    What is about as far away already stays where it is: it may stand on the table. So does what rests, if it is small
-    or far behind.
+    What is about as far away already stays where it is: it may stand on the table. So does what rests far behind.
     """
     for index in others.unique().tolist():
         its = others == index
@@ -112,8 +110,7 @@ def _held(
             continue
         factor = touched.median() / depth[beside].median()
         behind = -float(factor.log())
-        small = int(its.any(0).sum()) < scaled_px(SMALL_PX, its.shape[1])
-        if abs(behind) > SAME_DEPTH and not (bool(rests[its].any()) and (small or behind > BEFORE)):
+        if abs(behind) > SAME_DEPTH and not (behind > BEFORE and bool(rests[its].any())):
             depth = torch.where(its, factor * depth, depth)
     return depth
 
