@@ -12,7 +12,8 @@ from lerobot_msdyn.priors.robot import RELATIVE_ERROR
 class Plane(DepthProvider):
     """A table at the height and tilt that `camera.height_m` and `camera.tilt_deg` state, or under a calibrated robot.
 
-    Under a robot's table things that keep still stand upright, where edges say that they do.
+    On a robot's table things that keep still stand upright, where edges say that they do, and small ones that move are
+    boxes.
     It can always be used.
     """
 
