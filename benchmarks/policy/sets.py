@@ -31,12 +31,6 @@ FRONT, WRIST = "observation.images.front", "observation.images.wrist"
 RECORDED = "recorded"
 WITHOUT_JOINTS = "--camera.by_robot=false"
 WITH_JOINTS = ("--robot.name=so101",)
-FULL_FIT = (  # the package's defaults, where the reduced form has less
-    "--fit.steps=500",
-    "--fit.max_width=320",
-    "--scene.moving_gaussians=20000",
-    "--scene.moving_frames=20",
-)
 WITH_DEPTH = f"{RECORDED} with depth"
 FITTED = "product with joints"  # whose scenes other rows are rendered from
 ENDS = Path(__file__).with_name("ends.py")  # a plugin
@@ -316,6 +310,5 @@ SWEEPS: dict[str, dict[str, Row]] = {
     "variants": {f"variants {n}": replace(_many, variants=n) for n in (1, 2, 3, 6, 10)},
     "max_unseen": _swept("max_unseen", "max_unseen", (0.05, 0.1, 0.4, 1.0)),
     "fill": _swept("fill", "fill", ("nearest", "none")) | {"crop": _changed("crop", "--crop_to_covered=true")},
-    "fit": {"fitted in full": Row("product_joints_full", partial(product, flags=(*WITH_JOINTS, *FULL_FIT)))},
     "gate": _swept("min_expected_db", "gate.min_expected_db", (0, 22, 26)),
 }

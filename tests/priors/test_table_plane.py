@@ -11,10 +11,10 @@ from lerobot_msdyn.core.geometry import unproject_image
 from lerobot_msdyn.priors.depth.table_plane import (
     ground_plane,
     table_plane,
-    upright,
     with_standing,
     without_holes,
 )
+from lerobot_msdyn.priors.depth.uprights import with_boxes
 
 K = torch.tensor([[50.0, 0.0, 32.0], [0.0, 50.0, 24.0], [0.0, 0.0, 1.0]])
 
@@ -69,7 +69,7 @@ def test_things_stand_upright_on_a_known_ground(size: tuple[float, float, float]
     its = enters < leaves
     ground, instances = ground_plane(camera, 0.0), its.to(torch.uint8).expand(2, -1, -1)
     on_foot = with_standing(ground, instances)
-    standing = upright(on_foot, instances, camera, 0.0)
+    standing = with_boxes(on_foot, instances, camera, 0.0)
     off = [float((depth[0] - enters)[its].abs().mean()) for depth in (on_foot, standing)]
     assert off[0] > 0.012
     assert off[1] < 0.4 * off[0]

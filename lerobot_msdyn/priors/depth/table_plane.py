@@ -17,9 +17,6 @@ type Ground = Float[Tensor, "h w"]
 # nearer, rooms farther (benchmarks/notes/priors.md).
 _WALL = 2.0
 _LOWEST = 0.98  # quantile of an instance's rows where it touches the table; the very last ones may be stray pixels
-COMPACT = 0.1  # of its distance: a wider thing is hardly as deep as it is wide
-STEEPEST = 0.9  # share of a ray that falls, beyond which things are seen from above
-LEAST_AHEAD = 0.05  # metres per metre of z: rays that go less, or back, see no upright thing
 _SMOOTH_FRAMES = 9  # of the temporal smoothing of an instance's distance
 
 
@@ -70,40 +67,6 @@ def with_standing(
             whole = mask | (without_holes(mask) & (instances == 0))  # masks miss spots that look like the table
             depth = torch.where(whole, _standing(mask, rows)[:, None, None], depth)
     return depth.contiguous()
-
-
-def upright(
-    depth: Float[Tensor, "t h w"], instances: UInt8[Tensor, "t h w"], camera: CameraTrack, ground_m: float
-) -> Float[Tensor, "t h w"]:
-    """Depth (m) of `with_standing` before a fixed camera over a known ground (z up), of things that really stand.
-
-    One depth for all of a thing leans it back as far as the camera looks down. A compact one is a box instead, as deep
-    as it is wide: its front stands on its foot, and its top, level, ends where it ends in the picture.
-    """
-    pose = camera.world_from_camera[0]
-    falls, above = float(-pose[2, 2]), float(pose[2, 3]) - ground_m
-    if not 0.01 < falls < STEEPEST:
-        return depth
-    level = (1 - falls**2) ** 0.5
-    rays = unproject_image(torch.ones(camera.height, camera.width), camera.intrinsics[0]) @ pose[:3, :3].T
-    ahead = (rays[..., :2] @ pose[:2, 2] / level).clamp(min=LEAST_AHEAD)  # m, horizontally, per metre of z
-    descent = -rays[..., 2]
-    depth = depth.clone()
-    for instance in range(1, int(instances.max()) + 1):
-        mask = instances == instance
-        frames = mask.any(2).any(1).nonzero()[:, 0]
-        foot = torch.where(mask, depth, 0.0).amax((1, 2))
-        front = ((foot - above * falls) / level).clamp(min=LEAST_AHEAD * above)
-        wide = float((mask[frames].any(1).sum(1) * foot[frames]).median() / camera.intrinsics[0, 0, 0])
-        if not wide < COMPACT * float(foot[frames].median()):  # or not there at all
-            continue
-        row, column = mask[frames].any(2).float().argmax(1), mask[frames].any(1).float().cumsum(1)
-        column = (column >= column[:, -1:] / 2).float().argmax(1)
-        back = (front[frames] + wide) / ahead[row, column]
-        high = float((above - back * descent[row, column]).median().clamp(min=0))
-        top = (above - high) / descent.clamp(min=LEAST_AHEAD)
-        depth = torch.where(mask, torch.maximum(front[:, None, None] / ahead, top), depth)
-    return depth
 
 
 def without_holes(mask: Bool[Tensor, "t h w"]) -> Bool[Tensor, "t h w"]:

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from numpy import ndarray
 from torch import Tensor
 
+from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.geometry import unproject_image
 from lerobot_msdyn.core.images import masked_median
 from lerobot_msdyn.core.observations import RobotSeen, View
@@ -43,6 +44,7 @@ LEAST_EDGES = 2  # of a thing that stands ...
 SPANNED = 0.4  # ... and which share of its width they span
 STEEPEST_DEG = 65.0  # beyond that, things are seen from above
 MOST_ROLL_DEG = 20.0  # beyond that, columns of the picture are not upright
+COMPACT = 0.1  # of its distance: a wider thing that moves is hardly as deep as it is wide
 LEAST_AHEAD = 0.01  # metres per metre of z: rays that go less, or back, see no upright thing
 ON_GROUND = 0.999  # of the ground's depth: what is nearer stands
 STANDING_ERROR, GROUND_ERROR = 0.11, 0.02  # mean errors of what stands or is behind, and of the rest, measured on desks
@@ -102,6 +104,40 @@ def empty_scene(
     pose, intrinsics = (each[0].double().numpy() for each in (camera.world_from_camera, camera.intrinsics))
     upright = Upright.before(pose[2, :3], rays, max(float(pose[2, 3]) - robot.ground_m, 1e-3))
     return torch.from_numpy(with_uprights(ground.numpy(), picture, unknown, intrinsics, upright))
+
+
+def with_boxes(
+    depth: Float[Tensor, "t h w"], instances: UInt8[Tensor, "t h w"], camera: CameraTrack, ground_m: float
+) -> Float[Tensor, "t h w"]:
+    """Depth (m) of `with_standing` before a fixed camera over a known ground (z up), of compact things that move.
+
+    One depth for all of a thing leans it back as far as the camera looks down. A compact one is a box instead, as deep
+    as it is wide: its front stands on its foot, and its top, level, ends where it ends in the picture.
+    """
+    pose = camera.world_from_camera[0]
+    rays = unproject_image(torch.ones(camera.height, camera.width), camera.intrinsics[0])
+    above = max(float(pose[2, 3]) - ground_m, 1e-3)
+    vertical = Upright.before(pose[2, :3].numpy(), rays.numpy(), above)
+    if not vertical.usable:
+        return depth
+    ahead, falls = (torch.from_numpy(values).float() for values in (vertical.ahead, vertical.falls))
+    dip = float(vertical.down[2])  # of the optical axis: a sine
+    depth = depth.clone()
+    for instance in range(1, int(instances.max()) + 1):
+        mask = instances == instance
+        frames = mask.any(2).any(1).nonzero()[:, 0]
+        foot = torch.where(mask, depth, 0.0).amax((1, 2))
+        front = ((foot - above * dip) / (1 - dip**2) ** 0.5).clamp(min=LEAST_AHEAD)
+        wide = float((mask[frames].any(1).sum(1) * foot[frames]).median() / camera.intrinsics[0, 0, 0])
+        if not wide < COMPACT * float(foot[frames].median()):  # or not there at all
+            continue
+        row, column = mask[frames].any(2).float().argmax(1), mask[frames].any(1).float().cumsum(1)
+        column = (column >= column[:, -1:] / 2).float().argmax(1)
+        back = (front[frames] + wide) / ahead[row, column]
+        low = (back * falls[row, column]).median().clamp(max=1)  # how far its top is below the camera, in heights of it
+        box = torch.maximum(front[:, None, None] / ahead, low / falls.clamp(min=LEAST_AHEAD))
+        depth = torch.where(mask, box, depth)
+    return depth
 
 
 def still_error(empty: Float[Tensor, "h w"], ground: Float[Tensor, "h w"]) -> float:

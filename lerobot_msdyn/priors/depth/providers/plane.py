@@ -1,8 +1,8 @@
 """Depth without a sensor or learned weights: everything stands on a table."""
 
 from lerobot_msdyn.core.observations import DepthTraits
-from lerobot_msdyn.priors.depth.table_plane import ground_plane, table_plane, upright, with_standing
-from lerobot_msdyn.priors.depth.uprights import empty_scene, still_error
+from lerobot_msdyn.priors.depth.table_plane import ground_plane, table_plane, with_standing
+from lerobot_msdyn.priors.depth.uprights import empty_scene, still_error, with_boxes
 from lerobot_msdyn.priors.registry import DEPTH, Depth, DepthProvider, Estimate, Masks
 from lerobot_msdyn.priors.request import Request
 from lerobot_msdyn.priors.robot import RELATIVE_ERROR
@@ -37,5 +37,5 @@ class Plane(DepthProvider):
             how = f"a table seen from {height_m:g} m at {tilt_deg:g} degrees"
         depth = with_standing(ground, instances, empty)
         if view.robot is not None and view.camera.is_static:
-            depth = upright(depth, instances, view.camera, view.robot.ground_m)
+            depth = with_boxes(depth, instances, view.camera, view.robot.ground_m)
         return Estimate(Depth(depth, traits, ground), how)
