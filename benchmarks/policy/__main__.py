@@ -138,6 +138,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--form", choices=FORMS, default="reduced")
     parser.add_argument("--policy", choices=("small", "act"), default="small")
+    parser.add_argument("--cluttered", action="store_true", help="boxes, a bottle and a wall about the workspace")
     of_rows = "; between them; those of sweeps, too"
     parser.add_argument("--rows", type=lambda text: text.split(";"), help=of_rows)
     parser.add_argument("--sweep", choices=SWEEPS, help="rows of this sweep beside transforms and oracle")
@@ -158,7 +159,7 @@ def main(arguments: list[str]) -> None:
     if options.sweep:
         rows = {name: ROWS[name] for name in ("transforms", "oracle")} | SWEEPS[options.sweep]
     form = FORMS[options.form]
-    form = replace(form, seeds=options.seeds or form.seeds)
+    form = replace(form, seeds=options.seeds or form.seeds, cluttered=options.cluttered)
     if options.steps:
         form = replace(form, **{"act_steps" if options.policy == "act" else "steps": options.steps})
     name = name_of(options.policy, form)

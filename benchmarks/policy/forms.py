@@ -21,6 +21,7 @@ class Form:
     mesh_cell_m: float = 0.0  # vertices of meshes are merged within such cells; 0: as they come
     shadows: int = 1024  # px of the shadow map; 0: none
     samples: int = 4  # per pixel
+    cluttered: bool = False  # whether boxes, a bottle and a wall stand about the workspace
     variants: int = 2  # new episodes per recorded one, in every row; the product's default
     range_deg: float = 15.0  # of the oracle's and the homography's random level poses ...
     range_m: float = 0.05  # ... and shifts

@@ -11,6 +11,15 @@ from .forms import Form
 # As it comes (0.02) a jaw that is 5 mm off lands on it: policies that are told its place fail too.
 BLOCK_HALF_WIDTH_M = 0.013
 FAR_M = 10.0  # up to which a depth camera sees
+# What stands about the workspace of a cluttered scene, in the pictures alone: half sizes and centre (m), colour.
+BOXES_M: tuple[tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]], ...] = (
+    ((0.02, 1.5, 0.4), (-0.45, 0.0, 0.4), (0.72, 0.68, 0.6)),  # a wall
+    ((0.04, 0.05, 0.08), (-0.12, -0.24, 0.08), (0.55, 0.3, 0.2)),
+    ((0.03, 0.03, 0.06), (0.1, 0.27, 0.06), (0.25, 0.45, 0.3)),
+    ((0.03, 0.05, 0.015), (0.28, -0.26, 0.015), (0.75, 0.75, 0.78)),
+    ((0.05, 0.09, 0.02), (-0.2, 0.1, 0.02), (0.5, 0.15, 0.15)),
+)
+BOTTLE_M = (0.03, 0.07), (-0.08, 0.3, 0.07)  # radius and half height, centre
 WRIST_POSITION_M, WRIST_TILT_DEG, WRIST_FOVY_DEG = (0.0, 0.055, -0.03), 25.0, 70.0  # in the gripper's axes
 
 
@@ -26,6 +35,12 @@ class Scene:
         spec.body("gripper").add_camera(
             name="wrist", pos=WRIST_POSITION_M, quat=(np.cos(tilt), -np.sin(tilt), 0, 0), fovy=WRIST_FOVY_DEG
         )
+        if form.cluttered:
+            for size, place, colour in BOXES_M:
+                spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=place, rgba=(*colour, 1))
+            (radius, half), place = BOTTLE_M
+            bottle = {"type": mujoco.mjtGeom.mjGEOM_CYLINDER, "size": (radius, half, 0), "rgba": (0.2, 0.5, 0.6, 1)}
+            spec.worldbody.add_geom(**bottle, pos=place)
         if form.mesh_cell_m:
             simplify(spec, mujoco.MjModel.from_xml_path(str(xml)), form.mesh_cell_m)
         self.model = spec.compile()
@@ -66,8 +81,8 @@ class Scene:
         self.renderer.enable_segmentation_rendering()
         geom = self.renderer.render()[..., 0].copy()
         self.renderer.disable_segmentation_rendering()
-        floor = self.model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
-        return (geom >= 0) & ~floor[np.maximum(geom, 0)]
+        of_world = self.model.geom_bodyid == 0  # table and clutter
+        return (geom >= 0) & ~of_world[np.maximum(geom, 0)]
 
 
 def simplify(spec: mujoco.MjSpec, model: mujoco.MjModel, cell_m: float) -> None:

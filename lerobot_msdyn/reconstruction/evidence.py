@@ -2,9 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack, concatenated
@@ -28,6 +29,11 @@ class Evidence:
     depth: Float[Tensor, "k h w"]  # m, of what stands still, from each; known or guessed everywhere
     frames: Int[Tensor, "k h w"]  # that show what stands still there; 0 = filled from around
     moving_frames: Float[Tensor, " m"]  # frames that show each moving Gaussian
+
+    @cached_property
+    def corners(self) -> tuple[Float[Tensor, "k H W"], Int[Tensor, "k H W"]]:
+        """Per corner of a pixel the largest depth, and the most frames, of the pixels that meet there."""
+        return _largest_of_four(self.depth), _largest_of_four(self.frames.float()).long()
 
 
 @torch.no_grad()
@@ -57,26 +63,29 @@ def in_front(
 
     0 where the point is outside of the view or behind what the view shows.
     """
-    height, width = depth.shape
+    return _at_corners(points, camera, _largest_of_four(depth[None])[0], _largest_of_four(value.float()[None])[0])
+
+
+def _at_corners(
+    points: Float[Tensor, "n 3"], camera: CameraTrack, farthest: Float[Tensor, "H W"], most: Shaped[Tensor, "H W"]
+) -> Int[Tensor, " n"]:
+    """`in_front`, given the largest depth and value at each corner of a pixel."""
     seen = projected(points, camera)
     column, row = (torch.nan_to_num(seen.xy) + 0.5).long().unbind(-1)
-    around = row.clamp(0, height), column.clamp(0, width)
-    farthest, most = _largest_of_four(depth)[around], _largest_of_four(value.float())[around]
-    return torch.where(seen.inside & (seen.z <= farthest * (1 + TOLERANCE)), most, 0).long()
+    around = row.clamp(0, camera.height), column.clamp(0, camera.width)
+    return torch.where(seen.inside & (seen.z <= farthest[around] * (1 + TOLERANCE)), most[around], 0).long()
 
 
-def _largest_of_four(image: Float[Tensor, "h w"]) -> Float[Tensor, "h+1 w+1"]:
+def _largest_of_four(images: Float[Tensor, "k h w"]) -> Float[Tensor, "k h+1 w+1"]:
     """The largest value of the pixels that meet at each corner of a pixel."""
-    padded = torch.nn.functional.pad(image[None, None], (1, 1, 1, 1), mode="replicate")
-    return torch.nn.functional.max_pool2d(padded, 2, stride=1)[0, 0]
+    padded = torch.nn.functional.pad(images[:, None], (1, 1, 1, 1), mode="replicate")
+    return torch.nn.functional.max_pool2d(padded, 2, stride=1)[:, 0]
 
 
 def still_frames(evidence: Evidence, points: Float[Tensor, "n 3"]) -> Int[Tensor, " n"]:
     """Number of frames that show each of some surface points (m, world) of what stands still."""
-    seen = [
-        in_front(points, evidence.keys.select([i]), depth, frames)
-        for i, (depth, frames) in enumerate(zip(evidence.depth, evidence.frames, strict=True))
-    ]
+    corners = zip(*evidence.corners, strict=True)
+    seen = [_at_corners(points, evidence.keys.select([i]), *at) for i, at in enumerate(corners)]
     return torch.stack(seen).amax(0)
 
 

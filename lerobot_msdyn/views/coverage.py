@@ -13,10 +13,12 @@ from numpy import ndarray
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
-from lerobot_msdyn.core.geometry import transform_points, unproject, unproject_image
+from lerobot_msdyn.core.geometry import transform_points, unproject_image
 from lerobot_msdyn.core.serialise import to_device
+from lerobot_msdyn.core.visibility import TOLERANCE
 from lerobot_msdyn.reconstruction.evidence import Evidence, still_frames
 from lerobot_msdyn.scene.rendering import Rendering
+from lerobot_msdyn.views.kernels import look_up
 
 HOLE_ALPHA = 0.5  # below this opacity there is a hole: nothing is known to be there
 
@@ -71,13 +73,24 @@ def coverage_of(
 
 
 def looked(depth: Float[Tensor, "h w"], pose: CameraTrack, evidence: Evidence, before: Looked | None = None) -> Looked:
-    """Looks up what stands still in a picture: all of it, or what differs from one that was looked up before."""
-    if before is None:
+    """Looks up what stands still in a picture: on a CPU only what differs from one that was looked up before."""
+    if depth.device.type != "cpu":
         return Looked(depth, still_frames(evidence, _points(depth, pose)).reshape(depth.shape))
-    new = depth != before.depth
+    if before is None:
+        before = Looked(torch.full_like(depth, torch.nan), torch.zeros(depth.shape, dtype=torch.long))
     still = before.still.clone()
-    still[new] = still_frames(evidence, _points(depth, pose, new))
+    maps, offsets = _to_keys(pose, evidence.keys)
+    arrays = (depth, before.depth, maps, offsets, *evidence.corners)
+    look_up(*(values.contiguous().numpy() for values in arrays), TOLERANCE, still.numpy())
     return Looked(depth, still)
+
+
+def _to_keys(pose: CameraTrack, keys: CameraTrack) -> tuple[Float[Tensor, "k 3 3"], Float[Tensor, "k 3"]]:
+    """From pixels (x, y, 1) of a camera at 1 m to (x z, y z, z) of each key view, and what is added to that."""
+    key_from_camera = keys.camera_from_world.double() @ pose.world_from_camera[0].double()
+    K = keys.intrinsics.double()
+    maps = K @ key_from_camera[:, :3, :3] @ torch.linalg.inv(pose.intrinsics[0].double())
+    return maps, (K @ key_from_camera[:, :3, 3:])[..., 0]
 
 
 def angles_of(depth: Float[Tensor, "h w"], camera: CameraTrack, recorded: CameraTrack) -> Float32[ndarray, "h w"]:
@@ -96,14 +109,7 @@ def angles_of(depth: Float[Tensor, "h w"], camera: CameraTrack, recorded: Camera
     return torch.rad2deg(torch.arccos(cosine)).reshape(depth.shape).numpy()
 
 
-def _points(
-    depth: Float[Tensor, "h w"], camera: CameraTrack, which: Bool[Tensor, "h w"] | None = None
-) -> Float[Tensor, "n 3"]:
-    """What the pixels, or some of them, show (m, world) through the first pose of a camera."""
-    if which is None:
-        in_camera = unproject_image(depth, camera.intrinsics[0]).reshape(-1, 3)
-    else:
-        row, column = which.nonzero(as_tuple=True)
-        xy = torch.stack((column, row), dim=-1) + 0.5
-        in_camera = unproject(xy, depth[row, column], camera.intrinsics[0])
+def _points(depth: Float[Tensor, "h w"], camera: CameraTrack) -> Float[Tensor, "n 3"]:
+    """What the pixels show (m, world) through the first pose of a camera."""
+    in_camera = unproject_image(depth, camera.intrinsics[0]).reshape(-1, 3)
     return transform_points(camera.world_from_camera[0], in_camera)

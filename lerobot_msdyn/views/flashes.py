@@ -66,7 +66,7 @@ def too_large(new: Flash, recorded: Flash, config: GateConfig) -> str:
 
 
 def _means(picture: UInt8[ndarray, "h w 3"]) -> Float32[ndarray, "rows columns 3"]:
-    return cv2.resize(picture.astype(np.float32) / 255, CELLS, interpolation=cv2.INTER_AREA)
+    return cv2.resize(picture, CELLS, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
 
 
 def _largest(cells: list[ndarray]) -> Flash:

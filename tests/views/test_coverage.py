@@ -7,10 +7,10 @@ import torch
 
 from lerobot_msdyn.core.cameras import CameraTrack, intrinsics_from_fov, static_camera
 from lerobot_msdyn.core.config import Recipe
-from lerobot_msdyn.core.geometry import se3
+from lerobot_msdyn.core.geometry import se3, transform_points, unproject_image
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.reconstruction.background import EmptyScene, background_gaussians
-from lerobot_msdyn.reconstruction.evidence import Evidence, evidence_of
+from lerobot_msdyn.reconstruction.evidence import Evidence, evidence_of, still_frames
 from lerobot_msdyn.reconstruction.key_views import fixed_view
 from lerobot_msdyn.reconstruction.reconstruct import reconstruct
 from lerobot_msdyn.scene.dynamic import DynamicScene
@@ -18,10 +18,10 @@ from lerobot_msdyn.scene.rendering import Rendering, render_scene
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.nvs import covisibility
 from lerobot_msdyn.synthetic.viewpoints import heldout_cameras
-from lerobot_msdyn.views.coverage import Coverage, angles_of, coverage_of
+from lerobot_msdyn.views.coverage import Coverage, angles_of, coverage_of, looked
 from lerobot_msdyn.views.pictures import coverages, new_pictures
 
-WIDTH, HEIGHT = 64, 48
+WIDTH, HEIGHT = SIZE = 64, 48
 STEP = WIDTH // 2  # first column of the nearer half of the wall
 
 
@@ -82,14 +82,14 @@ def test_what_the_frame_before_has_shown_holds() -> None:
     scene, evidence, camera = wall()
     poses = camera.select([0, 0, 0])
     rendering = render_scene(scene, poses, torch.tensor([0, 1, 2]), extra=evidence.moving_frames)
-    nearer = rendering.depth.clone()
-    nearer[1, 10:20, 8:16] *= 0.9  # something else is there for a frame
-    together = coverage_of(replace(rendering, depth=nearer), poses, evidence)
+    changed = rendering.depth.clone()
+    changed[1, 10:20, 12:22] *= 1.1  # for a frame what is behind shows
+    together = coverage_of(replace(rendering, depth=changed), poses, evidence)
     for i, found in enumerate(together):
         alone = Rendering(*(getattr(rendering, name)[[i]] for name in ("rgb", "depth", "alpha", "moving", "extra")))
-        expected = coverage_of(replace(alone, depth=nearer[[i]]), poses.select([i]), evidence)[0]
+        expected = coverage_of(replace(alone, depth=changed[[i]]), poses.select([i]), evidence)[0]
         assert (found.frames_seen == expected.frames_seen).all()
-    assert together[1].unseen.sum() != together[0].unseen.sum()
+    assert together[1].unseen.sum() > together[0].unseen.sum() == together[2].unseen.sum()
 
 
 @pytest.mark.parametrize("kind", ["push", "sheet"])
@@ -122,3 +122,27 @@ def test_pictures_say_what_was_not_seen() -> None:
         seen_frames = coverage.frames_seen[~coverage.unseen]
         assert seen_frames.min() >= 1
         assert seen_frames.max() <= 6
+
+
+def test_the_compiled_look_up_is_that_of_devices() -> None:
+    torch.manual_seed(0)
+    K, identity = intrinsics_from_fov(WIDTH, HEIGHT, 60.0), torch.eye(4)
+    turned = torch.tensor([[0.98, 0.0, 0.199], [0.0, 1.0, 0.0], [-0.199, 0.0, 0.98]])
+    keys = CameraTrack(K.expand(2, 3, 3), torch.stack((identity, se3(turned, torch.tensor([0.2, 0.0, 0.1])))), *SIZE)
+    depth, frames = 1 + 0.3 * torch.rand(2, HEIGHT, WIDTH), torch.randint(0, 100, (2, HEIGHT, WIDTH))
+    evidence = Evidence(keys, keys, depth, frames, torch.zeros(0))
+    pose = CameraTrack(
+        intrinsics_from_fov(2 * WIDTH, 2 * HEIGHT, 60.0)[None], shifted(0.1)[None], 2 * WIDTH, 2 * HEIGHT
+    )
+    first = 1 + 0.3 * torch.rand(2 * HEIGHT, 2 * WIDTH)
+    second = first.clone()
+    second[20:40, 30:60] -= 0.2
+    before = looked(first, pose, evidence)
+    for picture, found in ((first, before), (second, looked(second, pose, evidence, before))):
+        points = transform_points(
+            pose.world_from_camera[0], unproject_image(picture, pose.intrinsics[0]).reshape(-1, 3)
+        )
+        wanted = still_frames(evidence, points).reshape(picture.shape)
+        assert (found.still != wanted).float().mean() < 1e-3  # where rounding decides
+        assert 0.01 < (wanted == 0).float().mean() < 0.9
+    assert (before.still == looked(second, pose, evidence, before).still)[60:].all()
