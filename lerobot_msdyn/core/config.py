@@ -371,7 +371,7 @@ class GateConfig:
     # Largest flicker of what stands still, relative to the video's own.
     max_flicker_ratio: float = between(2.0, 0, INFINITY)
     # Largest flash, a frame that is brighter or darker somewhere than those before and after, relative to the video's.
-    max_flash_ratio: float = between(1.5, 0, INFINITY)
+    max_flash_ratio: float = between(2.0, 0, INFINITY)
     # Smallest sharpness (variance of the Laplacian), relative to the video's.
     min_sharpness_ratio: float = between(0.1, 0, INFINITY)
     # Of a camera that moves: by how many pixels (of 320) a rolling shutter may bend fast frames; it is taken to read a

@@ -53,6 +53,6 @@ def test_a_view_may_flash_as_its_video_does() -> None:
     config = GateConfig()
     assert too_large(Flash(3, FLOOR), Flash(), config) == ""
     assert too_large(Flash(3, 0.5), Flash(8, 0.3), config) == ""
-    why = too_large(Flash(3, 0.61), Flash(8, 0.3), config)
-    assert why.startswith("frame 3 flashes by 0.61 of the brightness range, the recording by 0.30 at most")
-    assert "gate.max_flash_ratio 1.5" in why
+    why = too_large(Flash(3, 0.71), Flash(8, 0.3), config)
+    assert why.startswith("frame 3 flashes by 0.71 of the brightness range, the recording by 0.30 at most")
+    assert "gate.max_flash_ratio 2" in why
