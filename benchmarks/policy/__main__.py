@@ -9,6 +9,7 @@
 An SO-101 picks up a block in MuJoCo. Demonstrations of a scripted expert are recorded by LeRobot from a front camera
 and a wrist camera; each row of the table is a training set made of them (sets.py), all with equal gradient steps.
 Policies see the front camera and the joints. Every policy attempts the same tasks from every test camera (cameras.py).
+Each seed has new cameras of its own, as well as first weights: which cameras are drawn tells as much.
 Each finished set, training and camera is a file in FOLDER: the same command goes on where it was stopped.
 FOLDER/<policy>_<steps>.md and .svg hold the table and the plot of what is finished (--report: only those).
 
@@ -83,10 +84,10 @@ class Study:
         """What gives actions."""
         from . import act, small
 
-        frames = self.frames(row)
+        frames = self.frames(row, seed)
         if self.policy == "act":
             variants = [int(frames.variant[frames.episode == i][0]) for i in range(frames.episode.max() + 1)]
-            folder = self.sets.folder(row)
+            folder = self.sets.of_draw(seed).folder(row)
             out = self.store.root / "trainings" / place
             done = out / "done"
             if not done.exists():
@@ -102,20 +103,21 @@ class Study:
         network.load_state_dict(torch.load(self.store.made(f"trainings/{place}.pt", make), weights_only=True))
         return small.SmallPolicy(network, self.form)
 
-    def frames(self, row: Row) -> "Frames":
-        """A set's frames at the small network's size."""
+    def frames(self, row: Row, seed: int) -> "Frames":
+        """A set's frames at the small network's size; each seed has new cameras of its own."""
         import numpy as np
 
         from . import small
 
         size = (self.form.input_width, self.form.input_height)
 
-        folder = self.sets.folder(row)
+        sets = self.sets.of_draw(seed)
+        folder = sets.folder(row)
 
         def make(path: Path) -> None:
             np.savez(path, **vars(small.read(folder, size)))
 
-        with np.load(self.store.made(f"frames/{row.dataset}.npz", make)) as file:
+        with np.load(self.store.made(f"frames/{sets.name(row)}.npz", make)) as file:
             return small.Frames(**{name: file[name] for name in small.Frames.__dataclass_fields__})
 
 
@@ -143,7 +145,8 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--rows", type=lambda text: text.split(";"), help=of_rows)
     parser.add_argument("--sweep", choices=SWEEPS, help="rows of this sweep beside transforms and oracle")
     parser.add_argument("--steps", type=int, default=0, help="gradient steps; 0: the form's")
-    parser.add_argument("--seeds", type=int, default=0, help="trainings per row; 0: the form's")
+    seeds = "trainings per row, each with new cameras of its own; 0: the form's"
+    parser.add_argument("--seeds", type=int, default=0, help=seeds)
     parser.add_argument("--workers", type=int, default=0, help="of augment; 0: one per core")
     parser.add_argument("--depth_network", type=Path, help="FILE.onnx, for the row with a depth network")
     parser.add_argument("--pictures", action="store_true", help="compare the product's pictures with exact ones alone")

@@ -4,6 +4,7 @@ A further row is one entry of `ROWS`. Demonstrations (states of the simulator, f
 follow) are kept outside the datasets: the product sees a recording of two cameras and nothing else.
 """
 
+import copy
 import json
 import os
 import subprocess
@@ -47,7 +48,14 @@ class Sets:
         `workers` are those of the product's command, `depth_network` is a file of ONNX for rows with one.
         """
         self.store, self.form, self.workers, self.depth_network = store, form, workers, depth_network
+        self.draw = 0
         self._scene: Scene | None = None
+
+    def of_draw(self, draw: int) -> "Sets":
+        """The same with other samples of the new cameras: which ones were drawn tells as much as who was trained."""
+        other = copy.copy(self)
+        other.draw = draw
+        return other
 
     @property
     def scene(self) -> "Scene":
@@ -74,7 +82,11 @@ class Sets:
 
     def folder(self, row: "Row") -> Path:
         """The dataset that a row trains on."""
-        return self.store.made(f"sets/{row.dataset}", lambda path: row.make(self, path))
+        return self.store.made(f"sets/{self.name(row)}", lambda path: row.make(self, path))
+
+    def name(self, row: "Row") -> str:
+        """That of a row's dataset, in the store."""
+        return f"{row.dataset}_draw_{self.draw}" if row.drawn and self.draw else row.dataset
 
     def write(self, root: Path, episodes: Iterable[Episode], *, wrist: bool = False, depth: bool = False) -> None:
         """Records episodes through LeRobot's own API; `depth` is that of the pictures as they are rendered."""
@@ -124,11 +136,13 @@ class Sets:
 
     def random_poses(self, episode: int) -> list[np.ndarray]:
         """The level poses of the oracle and of the homography."""
-        return self._poses(np.random.default_rng([episode, 21]), self.form.variants)
+        key = [episode, 22, self.draw] if self.draw else [episode, 21]
+        return self._poses(np.random.default_rng(key), self.form.variants)
 
     def frame_poses(self, episode: int, variant: int, count: int) -> list[np.ndarray]:
         """Level poses for single frames, of the same spread."""
-        return self._poses(np.random.default_rng([episode, 21, variant]), count)
+        key = [episode, 22, self.draw, variant] if self.draw else [episode, 21, variant]
+        return self._poses(np.random.default_rng(key), count)
 
     def _poses(self, rng: np.random.Generator, count: int) -> list[np.ndarray]:
         bounds = self.form.range_deg, self.form.range_deg / 3, self.form.range_m
@@ -206,6 +220,7 @@ def product(
     flags: tuple[str, ...] = (WITHOUT_JOINTS,),
     *,
     scenes_of: str = "",
+    first_draw: str = "",
     of: str = RECORDED,
     network: bool = False,
 ) -> None:
@@ -216,14 +231,20 @@ def product(
         path: where it goes.
         flags: of the command.
         scenes_of: a row whose scenes are rendered; else they are fitted.
+        first_draw: the row itself, whose first draw's scenes are rendered in all others.
         of: the row that is the recording.
         network: whether depth is the network's.
     """
     source = sets.folder(ROWS[of])
     given = [f"--root={source}", f"--new_root={path}", "--new_repo_id=local/policy_msdyn", "--repo=local/policy"]
     given += [f"--variants={sets.form.variants}", f"--workers={sets.workers}"]
+    if sets.draw:
+        given += [f"--seed={sets.draw}"]
+        scenes_of = scenes_of or first_draw
     if scenes_of:
-        given += [f"--scenes={sets.folder(ROWS[scenes_of])}"]
+        given += [f"--scenes={sets.of_draw(0).folder(ROWS[scenes_of])}"]
+    else:
+        given += ["--save_scenes=true"]
     if network:
         given += [f"--priors.depth=onnx:{sets.depth_network}"]
     command = [sys.executable, "-m", "lerobot_msdyn.augment", *given]
@@ -257,6 +278,7 @@ class Row:
     transforms: bool = True  # LeRobot's image transforms
     variants: int | None = None  # new episodes per recorded one that are used; None: all
     source: bool = True  # whether the recorded episodes are used
+    drawn: bool = True  # whether it has new cameras, which differ from draw to draw
     network: bool = False  # whether it needs a depth network
 
     def keeps(self, variant: int) -> bool:
@@ -264,18 +286,21 @@ class Row:
         return self.source if variant < 0 else self.variants is None or variant < self.variants
 
 
+def _fitted(name: str, dataset: str, flags: tuple[str, ...], *, of: str = RECORDED, network: bool = False) -> Row:
+    return Row(dataset, partial(product, flags=flags, first_draw=name, of=of, network=network), network=network)
+
+
+_NETWORK, _DEPTH = f"{FITTED} and a depth network", f"{FITTED} and recorded depth"
 ROWS: dict[str, Row] = {
-    RECORDED: Row(RECORDED, recorded, transforms=False),
-    WITH_DEPTH: Row("recorded_depth", partial(recorded, depth=True), transforms=False),
-    "transforms": Row(RECORDED, recorded),
+    RECORDED: Row(RECORDED, recorded, transforms=False, drawn=False),
+    WITH_DEPTH: Row("recorded_depth", partial(recorded, depth=True), transforms=False, drawn=False),
+    "transforms": Row(RECORDED, recorded, drawn=False),
     "oracle": Row("oracle", oracle),
     "homography": Row("homography", homography),
-    "product": Row("product", product),
-    FITTED: Row("product_joints", partial(product, flags=(*WITH_JOINTS, "--save_scenes=true"))),
-    f"{FITTED} and a depth network": Row(
-        "product_network", partial(product, flags=WITH_JOINTS, network=True), network=True
-    ),
-    f"{FITTED} and recorded depth": Row("product_depth", partial(product, flags=WITH_JOINTS, of=WITH_DEPTH)),
+    "product": _fitted("product", "product", (WITHOUT_JOINTS,)),
+    FITTED: _fitted(FITTED, "product_joints", WITH_JOINTS),
+    _NETWORK: _fitted(_NETWORK, "product_network", WITH_JOINTS, network=True),
+    _DEPTH: _fitted(_DEPTH, "product_depth", WITH_JOINTS, of=WITH_DEPTH),
     "oracle at the product's poses": Row("oracle_product", partial(oracle_at_poses_of, "product")),
 }
 
@@ -296,7 +321,7 @@ SWEEPS: dict[str, dict[str, Row]] = {
     "range": {
         "product": ROWS["product"],
         "product within 15": Row(
-            "product_15", partial(product, flags=(WITHOUT_JOINTS, "--perturbation.azimuth_deg=15"))
+            "product_15", partial(product, flags=("--perturbation.azimuth_deg=15",), scenes_of="product")
         ),
         FITTED: ROWS[FITTED],
     }
@@ -309,6 +334,7 @@ SWEEPS: dict[str, dict[str, Row]] = {
     },
     "variants": {f"variants {n}": replace(_many, variants=n) for n in (1, 2, 3, 6, 10)},
     "max_unseen": _swept("max_unseen", "max_unseen", (0.05, 0.1, 0.4, 1.0)),
-    "fill": _swept("fill", "fill", ("nearest", "none")) | {"crop": _changed("crop", "--crop_to_covered=true")},
+    "fill": _swept("fill", "fill", ("nearest", "blur", "noise", "none"))
+    | {"crop": _changed("crop", "--crop_to_covered=true")},
     "gate": _swept("min_expected_db", "gate.min_expected_db", (0, 22, 26)),
 }

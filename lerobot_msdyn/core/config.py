@@ -29,7 +29,7 @@ from lerobot_msdyn.core.registry import Registry
 
 # Named: draccus finds the comment above a field only where its annotation holds no quotes.
 Device = Literal["auto", "cpu", "cuda"]
-Fill = Literal["inpaint", "nearest", "none"]
+Fill = Literal["inpaint", "nearest", "blur", "noise", "none"]
 POSE_ROTATIONS = ("matrix", "quaternion_xyzw", "quaternion_wxyz", "euler_xyz", "rotation_vector")
 FIXED = "fixed"  # provider of the camera as the dataset and its calibration have it
 _LEVELS = ["object", "primitive", "grain"]
@@ -415,7 +415,8 @@ class Recipe:
     perturbation: Perturbation = field(default_factory=lambda: Perturbation.get_choice_class("orbit")())
     # Largest share of a new view that no frame has shown, 0..1; a change that shows more is shrunk, or rejected.
     max_unseen: float = between(0.2, 0, 1)
-    # What stands where nothing was seen: inpaint (continued from what is behind), nearest, or none (black).
+    # What stands where nothing was seen: inpaint (continued from what is behind), nearest, blur (the colours around),
+    # noise (random colours), or none (black).
     fill: Fill = "inpaint"
     # Cut off what was not seen at the borders: a longer focal length at the same number of pixels.
     crop_to_covered: bool = False

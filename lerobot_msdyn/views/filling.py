@@ -40,7 +40,8 @@ def filled(
         rgb: the picture.
         alpha: its opacity; below `HOLE_ALPHA` there is a hole.
         depth: its depth, m.
-        fill: inpaint (Telea 2004) or nearest (the nearest pixel's colour).
+        fill: inpaint (Telea 2004), nearest (the nearest pixel's colour), blur (`filled_softly`) or noise (random
+            colours, the same ones in every picture of a size).
     """
     whole = (rgb / (alpha / SOLID_ALPHA).clamp(HOLE_ALPHA, 1)[..., None]).clamp(0, 1)
     holes = (alpha < HOLE_ALPHA).numpy()
@@ -52,6 +53,10 @@ def filled(
     picture = (whole * 255).round().to(torch.uint8).numpy()
     if fill == "nearest":
         continued = picture.reshape(-1, 3)[nearest_of(~unusable)]
+    elif fill == "blur":
+        continued = filled_softly(picture.transpose(2, 0, 1), ~unusable).transpose(1, 2, 0)
+    elif fill == "noise":
+        continued = np.random.default_rng(0).integers(256, size=picture.shape, dtype=np.uint8)
     else:
         continued = cv2.inpaint(picture, unusable.astype(np.uint8), INPAINT_RADIUS_PX, cv2.INPAINT_TELEA)
     return torch.where(torch.from_numpy(holes)[..., None], torch.from_numpy(continued).float() / 255, whole)

@@ -167,6 +167,31 @@ def test_rows_keep_what_they_say() -> None:
     assert kept["product"] == [True, True, True]
 
 
+def test_each_seed_has_new_cameras_of_the_same_scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    module_of_sets, form = module("sets"), module("forms").Form()
+    first = module_of_sets.Sets(module("store").Store(tmp_path, {}), form, 1)
+    second, rows = first.of_draw(1), module_of_sets.ROWS
+    assert [one.name(rows["transforms"]) for one in (first, second)] == ["recorded", "recorded"]
+    assert [one.name(rows["oracle"]) for one in (first, second)] == ["oracle", "oracle_draw_1"]
+    for one, other in zip(first.random_poses(3), second.random_poses(3), strict=True):
+        assert np.abs(one - other).max() > 1e-3
+    given: list[list[str]] = []
+
+    def run(command: list[str], **_: Any) -> subprocess.CompletedProcess[bytes]:
+        given.append(command)
+        Path(next(flag for flag in command if "--new_root" in flag).partition("=")[2]).mkdir()
+        return subprocess.CompletedProcess(command, 0)
+
+    monkeypatch.setattr(module_of_sets.subprocess, "run", run)
+    (tmp_path / "sets" / "recorded").mkdir(parents=True)
+    row = rows[module_of_sets.FITTED]
+    assert second.folder(row).name == "product_joints_draw_1"
+    fitted, drawn = given
+    assert "--save_scenes=true" in fitted
+    assert not any("--seed" in flag or "--scenes=" in flag for flag in fitted)
+    assert {"--seed=1", f"--scenes={tmp_path / 'sets' / 'product_joints'}"} <= set(drawn)
+
+
 def test_the_report_has_the_finished_cells(tmp_path: Path) -> None:
     forms, report = module("forms"), module("report")
     form = forms.Form(cameras=("recorded", "azimuth -10", "azimuth +10"), seeds=2, tasks=4)

@@ -17,12 +17,20 @@ def beside_an_object() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     return rgb, alpha, depth
 
 
-@pytest.mark.parametrize("fill", ["inpaint", "nearest"])
-def test_what_an_object_hid_is_continued_from_behind_it(fill: Fill) -> None:
+@pytest.mark.parametrize(("fill", "off"), [("inpaint", 0.02), ("nearest", 0.02), ("blur", 0.12)])
+def test_what_an_object_hid_is_continued_from_behind_it(fill: Fill, off: float) -> None:
     rgb, alpha, depth = beside_an_object()
     found = filled(rgb, alpha, depth, fill)
-    assert ((found[10:30, 30:36] - 0.5).abs() < 0.02).all()
+    assert ((found[10:30, 30:36] - 0.5).abs() < off).all()
     assert torch.equal(found[:, :30], rgb[:, :30])
+
+
+def test_noise_is_of_all_colours_and_the_same_in_every_picture() -> None:
+    rgb, alpha, depth = beside_an_object()
+    found = filled(rgb, alpha, depth, "noise")
+    assert found[10:30, 30:36].std() > 0.2
+    assert torch.equal(found[alpha > 0.5], rgb[alpha > 0.5])
+    assert torch.equal(filled(rgb, alpha, depth, "noise"), found)
 
 
 def test_beyond_the_border_the_picture_goes_on() -> None:
