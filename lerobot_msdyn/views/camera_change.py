@@ -2,10 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int64
 from numpy import ndarray
 from torch import Tensor
 from torch.quasirandom import SobolEngine
@@ -17,6 +18,8 @@ from lerobot_msdyn.core.perturbation import AMOUNTS, Perturbation, Viewpoint
 from lerobot_msdyn.reconstruction.result import Reconstruction
 from lerobot_msdyn.scene.store import SavedScene
 from lerobot_msdyn.views.offsets import offsets
+
+DIMENSIONS = 2 * len(AMOUNTS)  # coordinates of a sample
 
 
 @dataclass(frozen=True)
@@ -68,8 +71,10 @@ def sample_change(
 ) -> CameraChange:
     """One change for all cameras of an episode; a function of the seed and the numbers.
 
-    The variants of an episode (with `per_frame` the frames of one) are points of a scrambled Sobol sequence: the first
-    two lie in different halves of every range, the first four in different quarters, and so on, however many follow.
+    The first variants of all episodes are points of one scrambled Sobol sequence, so that few episodes fill the ranges
+    evenly. The binary digits of another such sequence change those of further variants: the first two of an episode lie
+    in different halves of every range, the first four in different quarters, and so on, however many follow. With
+    `per_frame` the frames of a new episode are points of a sequence of their own.
 
     Args:
         perturbation: the kind of change and its range.
@@ -88,9 +93,10 @@ def sample_change(
         key: Viewpoint(scene.camera, scene.distance, scene.metric, scene.up, other) for key, scene in scenes.items()
     }
     frames = min((len(view.camera) for view in views.values()), default=1)
-    points = _points([seed, episode, attempt], variant, 1)
     if perturbation.per_frame:
-        points = _points([seed, episode, attempt, variant], 0, frames)
+        points = _points([seed, episode, attempt, variant], frames)
+    else:
+        points = _point([seed, attempt], episode, variant)
     shares = perturbation.shares(points[:, : len(AMOUNTS)], points[:, len(AMOUNTS) :], frames)
     amounts = {key: perturbation.amounts(shares, view, variant) for key, view in views.items()}
     rows = {key: _checked(perturbation, values, frames) for key, values in amounts.items()}
@@ -110,12 +116,41 @@ def check_pose(perturbation: Perturbation, other: Float[Tensor, "4 4"] | None = 
         )
 
 
-def _points(key: list[int], first: int, count: int) -> Float32[ndarray, "count m"]:
-    """Points of the unit cube, two coordinates per amount."""
-    seed = int(np.random.SeedSequence(key).generate_state(1)[0])
-    engine = SobolEngine(2 * len(AMOUNTS), scramble=True, seed=seed)
-    points: ndarray = engine.fast_forward(first).draw(count).numpy()
+def _points(key: Sequence[int], count: int) -> Float32[ndarray, "count m"]:
+    """The first points of a scrambled Sobol sequence in the unit cube, two coordinates per amount."""
+    points: ndarray = SobolEngine(DIMENSIONS, scramble=True, seed=_seed(key)).draw(count).numpy()
     return points
+
+
+def _point(key: Sequence[int], episode: int, variant: int) -> Float32[ndarray, "1 m"]:
+    """One point of the unit cube: an episode's of a scrambled Sobol sequence, its digits changed by a variant's."""
+    digits = sobol_digits(_seed(key), episode) ^ sobol_digits(None, variant)
+    return (digits / (1 << SobolEngine.MAXBIT)).astype(np.float32)[None]
+
+
+def sobol_digits(seed: int | None, index: int) -> Int64[ndarray, " m"]:
+    """The binary digits of a Sobol sequence's point (2^30 times the point), of any index at the same cost.
+
+    Args:
+        seed: of the scrambling; None: not scrambled.
+        index: from 0, of 2^30 points, after which they come again.
+    """
+    directions, shift = _sobol(seed)
+    gray = (index ^ (index >> 1)) % (1 << SobolEngine.MAXBIT)
+    chosen = [bit for bit in range(SobolEngine.MAXBIT) if gray >> bit & 1]
+    digits: ndarray = np.bitwise_xor.reduce(directions[:, chosen], axis=1) ^ shift
+    return digits
+
+
+@lru_cache(maxsize=16)
+def _sobol(seed: int | None) -> tuple[Int64[ndarray, "m bits"], Int64[ndarray, " m"]]:
+    """Direction numbers and first point of a Sobol sequence; to make them takes torch some milliseconds."""
+    engine = SobolEngine(DIMENSIONS, scramble=seed is not None, seed=seed)
+    return engine.sobolstate.numpy(), engine.shift.numpy()
+
+
+def _seed(key: Sequence[int]) -> int:
+    return int(np.random.SeedSequence(key).generate_state(1)[0])
 
 
 def _checked(perturbation: Perturbation, amounts: ndarray, frames: int) -> Float[Tensor, "s n"]:

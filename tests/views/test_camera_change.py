@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torch.quasirandom import SobolEngine
 
 from lerobot_msdyn.core.cameras import intrinsics_from_fov, static_camera
 from lerobot_msdyn.core.errors import ConfigError
@@ -14,6 +15,7 @@ from lerobot_msdyn.core.geometry import invert_se3
 from lerobot_msdyn.core.perturbation import AMOUNTS, PERTURBATIONS, Perturbation
 from lerobot_msdyn.reconstruction.background import look_at_distance
 from lerobot_msdyn.scene.store import SavedScene, SceneSource
+from lerobot_msdyn.views import camera_change
 from lerobot_msdyn.views.camera_change import CameraChange, sample_change, units_of_shifts
 from lerobot_msdyn.views.offsets import offsets, orbit_offset
 from lerobot_msdyn.views.perturbations.dolly import Dolly
@@ -65,6 +67,24 @@ def test_variants_are_spread_over_the_range(variants: int) -> None:
     strata = ((samples + 1) / 2 * variants).floor()
     for column in strata.T:
         assert sorted(column.tolist()) == list(range(variants))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_few_episodes_fill_the_ranges_evenly(seed: int) -> None:
+    config = Orbit(azimuth_deg=1.0, elevation_deg=1.0, translation_m=1.0)
+    samples = torch.cat([amounts(config, v, seed=seed, episode=e) for e in range(32) for v in range(2)])[:, :5]
+    for column in samples.T:
+        assert (torch.histc(column, bins=8, min=-1, max=1) - 8).abs().max() <= 1  # at random by 4 or more
+    assert (torch.corrcoef(samples.T) - torch.eye(5)).square().mean().sqrt() < 0.05  # at random 0.11
+
+
+@pytest.mark.parametrize("seed", [None, 5])
+def test_digits_are_those_of_the_sequence(seed: int | None) -> None:
+    for first in (0, 100_000):
+        engine = SobolEngine(camera_change.DIMENSIONS, scramble=seed is not None, seed=seed).fast_forward(first)
+        for index, point in enumerate(engine.draw(70, dtype=torch.float64)):
+            digits = torch.from_numpy(camera_change.sobol_digits(seed, first + index))
+            assert (digits / 2**30 - point).abs().max() < 1e-7  # torch keeps the first point in single precision
 
 
 def test_with_per_frame_every_frame_has_its_own_sample() -> None:
