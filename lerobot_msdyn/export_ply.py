@@ -18,7 +18,7 @@ COMMAND = "python -m lerobot_msdyn.export_ply"
 class ExportPlyConfig:
     """`python -m lerobot_msdyn.export_ply`: frames of a kept scene as .ply files."""
 
-    # Output folder of `augment --save_scenes true`.
+    # Output of `augment --save_scenes true`, a folder or a name.
     scenes: Path | None = None
     # The source episode.
     episode: int = between(0, 0, MAX_INDEX)
@@ -35,10 +35,11 @@ def run(arguments: list[str]) -> int:
     config = parse_config(ExportPlyConfig, arguments, {}, command=COMMAND)
     if config.scenes is None:
         raise ConfigError(f"which scenes? {COMMAND} --scenes FOLDER [--episode 0] [--frames 0-9] (see --help)")
+    from lerobot_msdyn.dataset.named import output_folder
     from lerobot_msdyn.scene import store
     from lerobot_msdyn.scene.ply import export_frames
 
-    scenes = store.list_scenes(config.scenes)
+    scenes = store.list_scenes(output_folder(config.scenes))
     if config.episode not in scenes:
         there = ", ".join(map(str, scenes))
         raise ConfigError(f"{config.scenes}: no scene of episode {config.episode}; there are those of {there}")

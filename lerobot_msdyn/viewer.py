@@ -19,7 +19,7 @@ from lerobot_msdyn.core.cli import EXIT_OK, parse_config, run_command
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import ConfigError, DatasetError, MsdynError, OutputError
 from lerobot_msdyn.core.fields import MAX_INDEX, between
-from lerobot_msdyn.dataset.named import check_there
+from lerobot_msdyn.dataset.named import check_there, output_folder
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -49,7 +49,7 @@ class ViewerConfig(Recipe):
     root: Path | None = None
     # The episode to show.
     episode: int = between(0, 0, MAX_INDEX)
-    # Output folder of `augment --save_scenes true`; without it the episode is fitted first.
+    # Output of `augment --save_scenes true`, a folder or a name; without it the episode is fitted first.
     scenes: Path | None = None
     # Show it in a browser tab, served by this machine until Ctrl-C; also done where there is no display for a window.
     web: bool = False
@@ -151,7 +151,7 @@ def show_episode(config: ViewerConfig, stream: "rr.RecordingStream") -> None:
     source = open_source(config.repo_id, config.root)
     (index,) = select_episodes(source, [config.episode])
     cameras = select_cameras(source, config.cameras)
-    saved = None if config.scenes is None else store.list_scenes(config.scenes).get(index, {})
+    saved = None if config.scenes is None else store.list_scenes(output_folder(config.scenes)).get(index, {})
     if saved is not None:
         cameras = [key for key in cameras if key in saved]
         if not cameras:

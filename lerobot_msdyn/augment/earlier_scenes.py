@@ -6,6 +6,7 @@ from pathlib import Path
 from lerobot.datasets import LeRobotDatasetMetadata
 
 from lerobot_msdyn.core.errors import ConfigError
+from lerobot_msdyn.dataset.named import output_folder
 from lerobot_msdyn.reconstruction.on_disk import fit_digest, load_reconstruction
 from lerobot_msdyn.reconstruction.result import Reconstruction
 from lerobot_msdyn.scene.store import camera_folder, list_scenes, read_header, scenes_root
@@ -20,7 +21,7 @@ def problems_of_scenes(
         MsdynError: there are no scenes.
         ConfigError: they are of another dataset.
     """
-    there = list_scenes(folder)
+    there = list_scenes(output_folder(folder))
     problems = {}
     for index in episodes:
         name = f"{source.repo_id} episode {index}"
@@ -50,13 +51,13 @@ def earlier_scene(folder: Path, episode: int, camera: str) -> Reconstruction:
     Raises:
         MsdynError: a file is absent, damaged or of another schema.
     """
-    return load_reconstruction(camera_folder(scenes_root(folder), episode, camera))
+    return load_reconstruction(camera_folder(scenes_root(output_folder(folder)), episode, camera))
 
 
 def digests_of_scenes(folder: Path) -> dict[str, str]:
     """What tells the scenes of one run from those of another."""
     return {
         f"{index}/{key}": fit_digest(place)
-        for index, of_cameras in list_scenes(folder).items()
+        for index, of_cameras in list_scenes(output_folder(folder)).items()
         for key, place in of_cameras.items()
     }

@@ -397,8 +397,8 @@ class Recipe:
     render_depth: bool = True
     # Whether the reconstructed scenes are kept in the output, for training on views of them (docs/scene.md).
     save_scenes: bool = False
-    # Output of an earlier run with save_scenes, whose scenes are rendered again: nothing is fitted anew, and settings
-    # of priors, scene, motion and fit have no effect.
+    # Output of an earlier run with save_scenes, a folder or a name, whose scenes are rendered again: nothing is fitted
+    # anew, and settings of priors, scene, motion and fit have no effect.
     scenes: Path | None = None
     # Seed of every random choice; together with the episode and the variant it fixes the result.
     seed: int = between(0, 0, MAX_SEED)

@@ -18,6 +18,12 @@ def lerobot_home() -> Path:
     return Path(os.environ.get("HF_LEROBOT_HOME", Path(constants.HF_HOME) / "lerobot")).expanduser()
 
 
+def output_folder(place: Path) -> Path:
+    """The folder of an output: the place itself or, where there is none, that of the dataset of this name."""
+    named = lerobot_home() / place
+    return named if named.is_dir() and not place.is_dir() else place
+
+
 def check_there(repo_id: str, root: Path | None) -> None:
     """Whether there is a dataset in a folder or, without one, of a name: before slow imports.
 

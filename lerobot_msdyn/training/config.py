@@ -10,7 +10,7 @@ from lerobot_msdyn.core.fields import INFINITY, MAX_SEED, between
 class MixedViewsConfig:
     """`lerobot_msdyn.training`: which samples are seen from elsewhere while a policy is trained (docs/training.md)."""
 
-    # Output folder of `augment --save_scenes true`.
+    # Output of `augment --save_scenes true`, a folder or a name.
     scenes: Path = Path()
     # Share of the samples that are seen from elsewhere.
     probability: float = between(0.5, 0, 1)

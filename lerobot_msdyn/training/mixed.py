@@ -39,7 +39,7 @@ class MixedViews(torch.utils.data.Dataset):
 
         Args:
             dataset: the dataset from which the scenes were made, or the output of that run.
-            scenes: the output folder of `augment --save_scenes true`, or episode -> camera -> its scene.
+            scenes: the output of `augment --save_scenes true`, a folder or a name, or episode -> camera -> its scene.
             probability: share of the samples that are seen from elsewhere.
             perturbation: how cameras are moved; default: as in the run that saved the scenes.
             seed: of all random choices.

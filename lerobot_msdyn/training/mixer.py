@@ -14,6 +14,7 @@ from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.core.fields import problems
 from lerobot_msdyn.core.perturbation import Perturbation
+from lerobot_msdyn.dataset.named import output_folder
 from lerobot_msdyn.dataset.read import MILLIMETRES, depth_key_of
 from lerobot_msdyn.training.config import MixedViewsConfig
 from lerobot_msdyn.training.live import LiveScene
@@ -49,7 +50,7 @@ class ViewMixer:
         if wrong:
             raise ConfigError("; ".join(wrong))
         if isinstance(scenes, str | os.PathLike):
-            scenes = Path(scenes)
+            scenes = output_folder(Path(scenes))
         self.probability, self.seed, self.deltas = probability, seed, deltas
         self.perturbation, self.max_empty = settings_of(scenes, perturbation)
         check_pose(self.perturbation)

@@ -10,7 +10,7 @@ from lerobot.utils.constants import HF_LEROBOT_HOME
 
 from lerobot_msdyn.core.errors import DatasetError
 from lerobot_msdyn.dataset import read
-from lerobot_msdyn.dataset.named import check_named, lerobot_home
+from lerobot_msdyn.dataset.named import check_named, lerobot_home, output_folder
 from lerobot_msdyn.dataset.read import open_source
 
 
@@ -30,6 +30,17 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_home_is_that_of_lerobot() -> None:
     assert lerobot_home() == HF_LEROBOT_HOME
+
+
+def test_an_output_is_found_by_its_name(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "here").mkdir()
+    for place, found in (("here", "here"), ("local/desk", "local/desk"), ("local/none", "local/none")):
+        assert output_folder(Path(place)) == Path(found)
+    monkeypatch.chdir(tmp_path / "here")
+    assert output_folder(Path("local/desk")) == home / "local" / "desk"
+    assert output_folder(home / "here") == home / "here"
+    assert output_folder(Path("local/none")) == Path("local/none")
 
 
 def test_the_nearest_name_is_told(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
