@@ -302,6 +302,7 @@ ROWS: dict[str, Row] = {
     _NETWORK: _fitted(_NETWORK, "product_network", WITH_JOINTS, network=True),
     _DEPTH: _fitted(_DEPTH, "product_depth", WITH_JOINTS, of=WITH_DEPTH),
     "oracle at the product's poses": Row("oracle_product", partial(oracle_at_poses_of, "product")),
+    f"oracle at the poses of {FITTED}": Row("oracle_product_joints", partial(oracle_at_poses_of, FITTED)),
 }
 
 
