@@ -32,7 +32,7 @@ from lerobot_msdyn.core.files import write_whole
 from .cameras import CAMERAS, Placement
 from .forms import FORMS, Form
 from .report import outcomes, plot, table
-from .sets import ROWS, SWEEPS, WITH_DEPTH, Row, Sets
+from .sets import ROWS, SWEEPS, USUAL, Row, Sets
 from .store import Store
 
 if TYPE_CHECKING:
@@ -153,7 +153,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--report", action="store_true", help="print the table of what is finished, and stop")
     options = parser.parse_args(arguments)
     known = ROWS | {name: row for sweep in SWEEPS.values() for name, row in sweep.items()}
-    usual = [name for name, row in ROWS.items() if name != WITH_DEPTH and (options.depth_network or not row.network)]
+    usual = [name for name in USUAL if options.depth_network or not ROWS[name].network]
     chosen = options.rows or usual
     unknown = sorted(set(chosen) - set(known))
     if unknown:

@@ -304,6 +304,7 @@ ROWS: dict[str, Row] = {
     "oracle at the product's poses": Row("oracle_product", partial(oracle_at_poses_of, "product")),
     f"oracle at the poses of {FITTED}": Row("oracle_product_joints", partial(oracle_at_poses_of, FITTED)),
 }
+USUAL = ("transforms", "oracle", "homography", "product", FITTED, _NETWORK, _DEPTH)  # which fit two hours
 
 
 def _changed(name: str, *flags: str) -> Row:
