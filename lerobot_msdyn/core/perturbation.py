@@ -126,7 +126,7 @@ class Perturbation(draccus.ChoiceRegistry):
         """Shares of the bounds, -1..1, one column per amount; one row for all frames, or one for each.
 
         Args:
-            uniform: 0..1, spread evenly over the variants of an episode: one row, or with `per_frame` one per frame.
+            uniform: 0..1, spread evenly over episodes and their variants: one row, or with `per_frame` one per frame.
             phases: as many other values of that kind.
             frames: of the episode.
         """
