@@ -102,7 +102,7 @@ def test_cameras_that_move_with_the_robot_are_refused(
     ("flags", "message"),
     [
         (["--perturbation.azimuth_deg", "-5"], "perturbation.azimuth_deg is -5.0; expected a value from 0 to 90"),
-        (["--fill", "blur"], "fill"),
+        (["--fill", "paint"], "fill"),
         (["--max_unseen", "1.5"], "max_unseen is 1.5; expected a value from 0 to 1"),
         (["--perturbation.type", "spin"], "spin"),
         (
