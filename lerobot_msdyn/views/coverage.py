@@ -58,7 +58,7 @@ def coverage_of(
     """
     assert rendering.extra is not None
     device = rendering.depth.device
-    holds = camera.is_static and device.type == "cpu"  # elsewhere to look for what differs costs more than it spares
+    holds = camera.is_static
     camera = to_device(camera, device)
     shown, holes = [], []
     for i, (depth, alpha) in enumerate(zip(rendering.depth, rendering.alpha, strict=True)):
@@ -74,7 +74,7 @@ def coverage_of(
 
 def looked(depth: Float[Tensor, "h w"], pose: CameraTrack, evidence: Evidence, before: Looked | None = None) -> Looked:
     """Looks up what stands still in a picture: on a CPU only what differs from one that was looked up before."""
-    if depth.device.type != "cpu":
+    if depth.device.type != "cpu":  # where to look for what differs costs more than it spares
         return Looked(depth, still_frames(evidence, _points(depth, pose)).reshape(depth.shape))
     if before is None:
         before = Looked(torch.full_like(depth, torch.nan), torch.zeros(depth.shape, dtype=torch.long))

@@ -1,7 +1,7 @@
 """Holes of a picture, where no frame has shown anything, continued from what is around them.
 
 `filled` continues the farther surface rather than the nearer: for pictures that are written. `filled_softly` averages
-what is around: several times as fast, for pictures that are rendered while a policy is trained.
+what is around: several times as fast, for pictures that are rendered while a policy is trained, and for `fill: blur`.
 """
 
 import cv2
