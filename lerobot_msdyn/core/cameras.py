@@ -53,6 +53,13 @@ class CameraTrack:
         scale = torch.tensor([[width / self.width], [height / self.height], [1.0]], device=self.intrinsics.device)
         return replace(self, intrinsics=self.intrinsics * scale, width=width, height=height)
 
+    def cropped(self, rows: slice, columns: slice) -> "CameraTrack":
+        """The same camera with some of its pixels alone, from a first to before a last row and column."""
+        intrinsics = self.intrinsics.clone()
+        intrinsics[:, 0, 2] -= columns.start
+        intrinsics[:, 1, 2] -= rows.start
+        return replace(self, intrinsics=intrinsics, width=columns.stop - columns.start, height=rows.stop - rows.start)
+
 
 def concatenated(parts: Sequence[CameraTrack]) -> CameraTrack:
     """One camera's tracks over consecutive times, as one."""

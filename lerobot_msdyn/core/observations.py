@@ -157,6 +157,18 @@ class View:
         robot = None if self.robot is None else self.robot.select(frames)
         return replace(self, rgb=self.rgb[frames], camera=self.camera.select(frames), depth=depth, robot=robot)
 
+    def cropped(self, rows: slice, columns: slice) -> "View":
+        """The same video in some rows and columns alone."""
+        window = (slice(None), rows, columns)
+        depth, robot = self.depth, self.robot
+        return replace(
+            self,
+            rgb=self.rgb[window],
+            camera=self.camera.cropped(rows, columns),
+            depth=None if depth is None else depth[window],
+            robot=None if robot is None else replace(robot, depth=robot.depth[window], moving=robot.moving[window]),
+        )
+
     def shrunk(self, max_width: int) -> "View":
         """The same video with at most `max_width` columns; depth keeps its values (nearest pixel)."""
         height, width = self.rgb.shape[1:3]

@@ -1,7 +1,9 @@
 """How brightness changes over time: of the static set by the video alone, of the moving set by a rendered scene."""
 
 import functools
+from collections import deque
 from dataclasses import dataclass
+from itertools import islice
 
 import cv2
 import numpy as np
@@ -17,7 +19,7 @@ from lerobot_msdyn.core.sampling import scaled_px, scaled_window
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.core.visibility import projected
 from lerobot_msdyn.priors import Priors
-from lerobot_msdyn.render.cpu.threads import in_threads
+from lerobot_msdyn.render.cpu.threads import each_on, in_threads
 from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.rendering import render_scene
 from lerobot_msdyn.scene.shading import Shading, encode_gain, no_shading
@@ -57,14 +59,15 @@ def static_shading(scene: DynamicScene, view: View, priors: Priors, empty: UInt8
         def sums_of(frame: int) -> Float32[ndarray, "a b 3"]:
             return _rendered_sums(scene, view, priors, frame, around)
 
-    sums = [sums_of(t) for t in range(min(2, frames))]
+    coming = in_threads(sums_of, range(frames))
+    sums = deque(islice(coming, 2), maxlen=3)  # of a frame and those beside it
     fields = []
     for t in range(frames):
         fields.append(encode_gain(torch.from_numpy(_ratio(np.sum(sums, axis=0)))))
         if t + 2 < frames:
-            sums.append(sums_of(t + 2))
-        if t > 0:
-            del sums[0]
+            sums.append(next(coming))
+        elif t > 0:
+            sums.popleft()
     return Shading(torch.stack(fields), places, no_shading(0, len(scene.moving), frames).moving)
 
 
@@ -180,8 +183,7 @@ def moving_gain(scene: DynamicScene, view: View, priors: Priors, backend: str = 
     """
     frames = sorted({*range(0, len(view.rgb), MOVING_STEP), len(view.rgb) - 1})
     of_frame = functools.partial(_seen_sums, scene, view, priors, backend)
-    on_host = scene.device.type == "cpu"
-    sums = torch.stack(list(in_threads(of_frame, frames) if on_host else map(of_frame, frames)))  # s m 2
+    sums = torch.stack([*each_on(scene.device, of_frame, frames)])  # s m 2
     if len(frames) > 2:
         padded = torch.nn.functional.pad(sums.permute(1, 2, 0), (1, 1))
         sums = torch.nn.functional.avg_pool1d(padded, 3, stride=1).permute(2, 0, 1)
@@ -197,7 +199,7 @@ def _seen_sums(scene: DynamicScene, view: View, priors: Priors, backend: str, fr
     usable = ((rendered.moving[0] > SURE_WEIGHT) & (priors.instances[frame] > 0)).numpy()
     recorded, rendered_grey = _grey(view.rgb[frame].numpy()), _grey(255 * rendered.rgb[0].numpy())
     sums = torch.from_numpy(_blurred_sums(recorded, rendered_grey, usable))
-    means = scene.at(when).means[0, len(scene.static) :].cpu()
+    means = scene.positions(when)[0, len(scene.static) :].cpu()
     seen = projected(means, camera)
     own = sums[seen.pixel]
     compared = seen.visible(rendered.depth[0]) & (own[:, 2] > SURE_WEIGHT)

@@ -111,8 +111,8 @@ def fit(
             parameters.begin_motion()
         scene = parameters.scene
         if step == int(config.moving_gain_from * config.steps) and len(scene.moving) > 0:
-            seen = view if poses is None else replace(view, camera=poses.result())
-            parameters.shade(_measured_shading(scene, seen, priors, backend))
+            filmed = view if poses is None else replace(view, camera=poses.result())
+            parameters.shade(_measured_shading(scene, filmed, priors, backend))
             scene = parameters.scene
         drawn = next(order)
         frames = drawn.to(scene.device)
@@ -121,14 +121,15 @@ def fit(
             through = poses.camera
             known = replace(through, world_from_camera=through.world_from_camera.detach())
             targets = replace(targets, view=replace(targets.view, camera=known))
-        camera = through.select(frames)
-        where = None
+        camera, seen, where = through.select(frames), targets, None
         if focus is not None and step % config.whole_every > 0 and len(scene.moving) > 0:
-            scene, where = focus(scene, int(drawn))
+            look = focus(scene, int(drawn))
+            scene, where = look.scene, look.where
+            camera, seen = camera.cropped(look.rows, look.columns), targets.cropped(look.rows, look.columns)
         snapshot = scene.at(frames, camera.world_from_camera[:, :3, 3])
         density.watch(snapshot)
         rendering = render_snapshot(snapshot, camera, scene.near, backend)
-        now = FitStep(scene, frames, rendering, targets, random, backend, where)
+        now = FitStep(scene, frames, rendering, seen, random, backend, where)
         values = {name: term(now) for name, (term, _) in terms.items()}
         loss: Float[Tensor, ""] | None = None
         if values:

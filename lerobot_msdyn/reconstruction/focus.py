@@ -3,6 +3,8 @@
 What stands still is the same at every frame, so that the steps between, which look at whole pictures, suffice for it.
 """
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 import torch
@@ -19,6 +21,16 @@ from lerobot_msdyn.scene.footprints import footprints
 
 AROUND_PX = 8  # of 320: about what moves, by mask or by motion, that is looked at as well
 BY_PIXEL = {"rgb", "depth", "mask"}  # loss terms that leave out pixels that are not looked at
+
+
+@dataclass(frozen=True)
+class Look:
+    """What a step looks at that does not look at a whole picture."""
+
+    scene: DynamicScene  # what is rendered: its static set without gradients
+    rows: slice  # of the picture, that are rendered ...
+    columns: slice
+    where: Bool[Tensor, "1 h w"]  # ... and the pixels of these that the scene shows whole
 
 
 class Focus:
@@ -45,6 +57,7 @@ class Focus:
             row, column = (index[moved.inside].numpy() for index in moved.pixel)
             moving[row, column] = 1
             regions.append(torch.from_numpy(cv2.dilate(moving, window) > 0))
+        self._crops = [_around(region) for region in regions]
         self._regions = torch.stack(regions).to(device)
         self._shown: dict[int, Int[Tensor, " n"]] = {}  # by frame, the static Gaussians that its region may show
 
@@ -60,15 +73,21 @@ class Focus:
         return config.whole_every > 1 and suffices and not learns and terms <= BY_PIXEL
 
     @torch.no_grad()
-    def __call__(self, scene: DynamicScene, frame: int) -> tuple[DynamicScene, Bool[Tensor, "1 h w"]]:
-        """What is rendered at a frame, its static set without gradients, and the pixels that it shows whole.
+    def __call__(self, scene: DynamicScene, frame: int) -> Look:
+        """Where a step looks at a frame.
 
         On a GPU all of the scene is rendered, without waiting for what can be left out.
         """
-        region = self._regions[frame]
+        region, crop = self._regions[frame], self._crops[frame]
         rows: Tensor | slice = slice(None)
         if region.device.type == "cpu":
             if frame not in self._shown:
                 self._shown[frame] = self._still.may_cover(region.numpy()).nonzero()[:, 0]
             rows = self._shown[frame]
-        return scene.select_static(rows), region[None]
+        return Look(scene.select_static(rows), *crop, region[None][:, *crop])
+
+
+def _around(region: Bool[Tensor, "h w"]) -> tuple[slice, slice]:
+    """The rows and columns of a region; of an empty one the first of each."""
+    rows, columns = (region.any(axis).nonzero()[:, 0].tolist() or [0] for axis in (1, 0))
+    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)

@@ -20,6 +20,7 @@ from lerobot_msdyn.motion.to_video.register import Recording
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.reconstruction.background import fill_depth, pixel_gaussians
 from lerobot_msdyn.reconstruction.key_views import KeyView, key_views, static_gaussians
+from lerobot_msdyn.render.cpu.threads import in_threads
 from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.gaussians import Gaussians, concatenate, isotropic
 
@@ -77,8 +78,8 @@ def gather_moving(
     few = frames if sharp else evenly(len(view), min(config.moving_frames, ROUGH_FRAMES)).tolist()
     border_px = config.mask_border_px if sharp else max(config.mask_border_px, ROUGH_BORDER_PX)
     known = 0 if priors.bodies is None else priors.bodies.instance
-    gathered, parts = [], []
-    for frame in sorted({*frames, *few}):
+
+    def taken(frame: int) -> tuple[Gaussians, Int[Tensor, " n"]] | None:
         depth, instances = priors.depth[frame], priors.instances[frame]
         body = (instances == known) & (instances > 0)
         chosen = torch.zeros_like(body)
@@ -87,18 +88,17 @@ def gather_moving(
         if frame in frames:
             chosen |= _certain(instances > 0, depth, config.mask_border_px) & body
         if not bool(chosen.any()):
-            continue
-        filled = fill_depth(priors.depth[frame])
-        pixels, _ = pixel_gaussians(view.rgb[frame], filled, view.camera, frame, where=chosen)
-        canonical, part = to_canonical(pixels, motion, frame, priors.instances[frame][chosen].long())
-        gathered.append(canonical)
-        parts.append(part)
+            return None
+        pixels, _ = pixel_gaussians(view.rgb[frame], fill_depth(depth), view.camera, frame, where=chosen)
+        return to_canonical(pixels, motion, frame, instances[chosen].long())
+
+    gathered = [some for some in in_threads(taken, sorted({*frames, *few})) if some is not None]
     if not gathered:
         empty = pixel_gaussians(view.rgb[0], fill_depth(priors.depth[0]), view.camera, 0)[0]
         return empty.select(torch.zeros(0, dtype=torch.long)), torch.zeros(0, dtype=torch.long)
     depth = priors.depth[(priors.instances > 0) & (priors.depth > 0)]
     voxel = config.moving_voxel_px * float(depth.median()) / float(view.camera.intrinsics[0, 0, 0])
-    points, part = concatenate(gathered), torch.cat(parts)
+    points, part = concatenate([points for points, _ in gathered]), torch.cat([part for _, part in gathered])
     extent = float((points.means.amax(0) - points.means.amin(0)).max())
     growth = 1.0
     merged = merge_voxels(points, part, voxel)
@@ -126,14 +126,18 @@ def contradicted(
     A point that its part's motion puts in front of the recorded surface, where nothing moves, cannot be there; too
     many such frames among those in which it is inside the image are held against it.
     """
-    wrong, inside = torch.zeros(len(points)), torch.zeros(len(points))
-    for frame in frames:
+
+    def seen_at(frame: int) -> tuple[Bool[Tensor, " n"], Bool[Tensor, " n"]]:
         world = motion.moved(points, part, torch.tensor([frame]))[0][0]
         seen = projected(world, view.camera.select([frame]))
         surface = priors.depth[frame][seen.pixel]
         still = _grown(priors.instances[frame] > 0)[seen.pixel].logical_not()
-        wrong += still & (surface > 0) & seen.visible(priors.depth[frame], -FRONT_MARGIN)
-        inside += seen.inside
+        return still & (surface > 0) & seen.visible(priors.depth[frame], -FRONT_MARGIN), seen.inside
+
+    wrong, inside = torch.zeros(len(points)), torch.zeros(len(points))
+    for wrong_now, inside_now in in_threads(seen_at, frames):
+        wrong += wrong_now
+        inside += inside_now
     return wrong > MAX_CONTRADICTIONS * inside
 
 
@@ -150,8 +154,11 @@ def to_canonical(
 def merge_voxels(gaussians: Gaussians, part: Int[Tensor, " n"], voxel: float) -> tuple[Gaussians, Int[Tensor, " m"]]:
     """One Gaussian per occupied voxel (side in m) and part: mean position and colour, the first one's shape."""
     corner = gaussians.means.amin(0)
-    cells = torch.cat((((gaussians.means - corner) / voxel).floor().long(), part[:, None]), dim=1)
-    _, group, count = torch.unique(cells, dim=0, return_inverse=True, return_counts=True)
+    cell = torch.zeros_like(part)
+    for index in (*((gaussians.means - corner) / voxel).floor().long().T, part):  # one number each: sorted faster
+        values, rank = torch.unique(index, return_inverse=True)
+        cell = cell * len(values) + rank
+    _, group, count = torch.unique(cell, return_inverse=True, return_counts=True)
     first = torch.full((len(count),), len(group)).scatter_reduce(0, group, torch.arange(len(group)), "amin")
 
     def mean(values: Float[Tensor, "n *_"]) -> Float[Tensor, "m *_"]:

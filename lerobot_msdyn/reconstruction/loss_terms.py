@@ -1,7 +1,7 @@
 """What a loss term is given. The terms are files of their own in `losses/`, or a user's (docs/extending.md)."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -24,6 +24,13 @@ class Targets:
     moves: Bool[Tensor, "t h w"]
     certain: Bool[Tensor, "t h w"]  # where the mask can be trusted
     distance: float  # m, to the look-at point: the scene's unit of length
+
+    def cropped(self, rows: slice, columns: slice) -> "Targets":
+        """The same in some rows and columns alone, for terms that compare pixel by pixel."""
+        window = (slice(None), rows, columns)
+        priors = replace(self.priors, depth=self.priors.depth[window], instances=self.priors.instances[window])
+        moves, certain = self.moves[window], self.certain[window]
+        return replace(self, view=self.view.cropped(rows, columns), priors=priors, moves=moves, certain=certain)
 
 
 @dataclass(frozen=True)

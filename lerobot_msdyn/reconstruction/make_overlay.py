@@ -8,7 +8,7 @@ import torch
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.reconstruction.unexplained import Comparison
-from lerobot_msdyn.render.cpu.threads import in_threads
+from lerobot_msdyn.render.cpu.threads import each_on
 from lerobot_msdyn.scene.dynamic import DynamicScene, patched
 from lerobot_msdyn.scene.overlay import FramePatch, Overlay, packed
 
@@ -45,7 +45,7 @@ def overlay_of(
         return comparison.patch(snapshot, frame, wrong, comparison.taken(wrong, frame))
 
     frames = range(len(view.rgb))
-    overlay = packed([*(in_threads(patch_of, frames) if scene.device.type == "cpu" else map(patch_of, frames))])
+    overlay = packed([*each_on(scene.device, patch_of, frames)])
     percent = 100 * len(overlay.means) / max(priors.depth.numel(), 1)
     logger.info("overlay: %.1f %% of all pixels are not explained and shown as recorded", percent)
     return overlay

@@ -20,7 +20,7 @@ from lerobot_msdyn.core.visibility import projected
 from lerobot_msdyn.motion.model.compose import compose_points
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.reconstruction.unexplained import COLOUR_ERROR, SMOOTH_PX, Comparison, blurred
-from lerobot_msdyn.render.cpu.threads import in_threads
+from lerobot_msdyn.render.cpu.threads import each_on
 from lerobot_msdyn.scene.dynamic import DynamicScene, Snapshot
 from lerobot_msdyn.scene.overlay import FramePatch
 from lerobot_msdyn.scene.short_lived import STILL, ShortLived
@@ -67,10 +67,9 @@ def short_lived_of(scene: DynamicScene, view: View, priors: Priors, reach: int, 
         backend: of the rasterizer.
     """
     comparison, host, count = Comparison(scene, view, priors, backend), to_device(scene, "cpu"), len(view.rgb)
-    everywhere = in_threads if scene.device.type == "cpu" else map
-    wrong = [*everywhere(lambda frame: comparison.wrong(comparison.snapshot(frame), frame), range(count))]
+    wrong = [*each_on(scene.device, lambda frame: comparison.wrong(comparison.snapshot(frame), frame), range(count))]
     keys = key_frames(count, reach)
-    born = [*everywhere(lambda key: _born(comparison, host, key, reach, wrong), keys)]
+    born = [*each_on(scene.device, lambda key: _born(comparison, host, key, reach, wrong), keys)]
     shown = [_shown(born, frame) for frame in range(count)]
     own = len(scene.static) + len(scene.moving)
     unhidden = ShortLived(
@@ -94,7 +93,7 @@ def short_lived_of(scene: DynamicScene, view: View, priors: Priors, reach: int, 
         covered = torch.from_numpy(_covered(patch.means, comparison, frame) & wrong[frame])
         return comparison.hidden(scene.positions(torch.tensor([frame]))[0], moving, frame, covered, covered)
 
-    found = replace(unhidden, hidden=packed_rows([*everywhere(hidden, range(count))]))
+    found = replace(unhidden, hidden=packed_rows([*each_on(scene.device, hidden, range(count))]))
     each = len(found.shown) / max(len(found.means), 1)
     logger.info("short-lived: %d Gaussians, each shown at %.1f frames", len(found.means), each)
     return found

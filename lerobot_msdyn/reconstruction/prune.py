@@ -3,7 +3,7 @@
 import logging
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
@@ -11,8 +11,9 @@ from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.core.visibility import projected
+from lerobot_msdyn.render.cpu.threads import each_on
 from lerobot_msdyn.scene.dynamic import DynamicScene
-from lerobot_msdyn.scene.rendering import render_scene
+from lerobot_msdyn.scene.rendering import render_snapshot
 
 logger = logging.getLogger(__name__)
 
@@ -31,17 +32,20 @@ def without_contradicted(scene: DynamicScene, view: View) -> DynamicScene:
     that its own colour is another, as those of fine texture, which blend, may be.
 
     Args:
-        scene: fitted, without an overlay.
+        scene: fitted, without patches.
         view: the video, at the size at which it was fitted.
     """
     count = len(scene.moving)
     if count == 0:
         return scene
     frames = evenly(len(view), SAMPLES)
-    seen, wrong = (torch.zeros(count, device=scene.device) for _ in range(2))
-    for frame in frames.split(1):
+
+    def compared(frame: Int[Tensor, "1"]) -> tuple[Bool[Tensor, " m"], Bool[Tensor, " m"]]:
         camera = to_device(view.camera.select(frame), scene.device)
-        visible, differs = _compared(scene, camera, frame, view.rgb[frame[0]].to(scene.device) / 255)
+        return _compared(scene, camera, frame, view.rgb[frame[0]].to(scene.device) / 255)
+
+    seen, wrong = (torch.zeros(count, device=scene.device) for _ in range(2))
+    for visible, differs in each_on(scene.device, compared, frames.split(1)):
         seen += visible
         wrong += visible & differs
     kept = wrong <= MOST_WRONG * seen
@@ -58,7 +62,7 @@ def _compared(
     seen = projected(means, camera)
     row, column = seen.pixel
     height, width = recorded.shape[:2]
-    rendering = render_scene(scene, camera, frame)
+    rendering = render_snapshot(snapshot, camera, scene.near)
     away = (rendering.rgb[0].clamp(0, 1) - recorded).abs().mean(-1)
     away = torch.nn.functional.max_pool2d(away[None, None], 3, stride=1, padding=1)[0, 0]
     error = torch.full_like(means[:, 0], float("inf"))

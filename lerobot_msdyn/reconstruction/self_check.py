@@ -5,6 +5,7 @@ were not fitted to them. New views are rendered with the overlay, which every fr
 them is judged with it, and what the scene alone makes of frames that it never saw is told beside.
 """
 
+import functools
 import logging
 from dataclasses import dataclass
 
@@ -21,6 +22,7 @@ from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.reconstruction.account import Account, account_line
 from lerobot_msdyn.reconstruction.fast_camera import fast_sharpness, skew_px, speed_px
+from lerobot_msdyn.render.cpu.threads import each_on
 from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.rendering import render_scene
 from lerobot_msdyn.scene.sources import Sources, sources_of
@@ -180,7 +182,9 @@ def _track_residual(scene: DynamicScene, camera: CameraTrack, priors: Priors) ->
     visible, xy = tracks.visible[measured], tracks.xy[measured]
     first = visible.long().argmax(1)
     times = evenly(scene.frames, TRACK_FRAMES)
-    gaussians = {int(time): _projected(scene, camera, int(time)) for time in torch.cat((times, first.unique()))}
+    needed = sorted({*times.tolist(), *first.tolist()})
+    projections = each_on(scene.device, functools.partial(_projected, scene, camera), needed)
+    gaussians = dict(zip(needed, projections, strict=True))
     distances = []
     for point in range(len(measured)):
         start = int(first[point])
@@ -193,5 +197,5 @@ def _track_residual(scene: DynamicScene, camera: CameraTrack, priors: Priors) ->
 
 def _projected(scene: DynamicScene, camera: CameraTrack, time: int) -> Float[Tensor, "m 2"]:
     """Where the moving Gaussians are in the picture (px) at a frame."""
-    means = scene.at(torch.tensor([time])).means[0, len(scene.static) :].cpu()
+    means = scene.positions(torch.tensor([time]))[0, len(scene.static) :].cpu()
     return project(transform_points(camera.camera_from_world[time], means), camera.intrinsics[time])[0]

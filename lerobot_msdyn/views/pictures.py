@@ -14,7 +14,7 @@ from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.config import Fill, Recipe
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.reconstruction.result import FittedWindow, Reconstruction
-from lerobot_msdyn.render.cpu.threads import in_threads
+from lerobot_msdyn.render.cpu.threads import each_on
 from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.rendering import Rendering, render_frames
 from lerobot_msdyn.views.coverage import Coverage, Looked, coverage_of, looked
@@ -128,7 +128,7 @@ def _rendered[T](
         on_cpu = window.scene.device.type == "cpu"
         size = min(BATCH, max(1, PIXELS_AT_ONCE // (camera.width * camera.height))) if on_cpu else GPU_BATCH
         batches = [slice(start, min(start + size, len(times))) for start in range(0, len(times), size)]
-        yield from in_threads(some, batches) if on_cpu else map(some, batches)
+        yield from each_on(window.scene.device, some, batches)
 
 
 def _some_made[T](

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from lerobot_msdyn.core.cameras import concatenated, intrinsics_from_fov, static_camera
+from lerobot_msdyn.core.geometry import project
 
 K = [[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]
 
@@ -32,3 +33,14 @@ def test_static_camera_stands_still() -> None:
     assert camera.is_static
     assert torch.equal(camera.camera_from_world, torch.eye(4).expand(4, 4, 4))
     assert len(camera.select([1, 3])) == 2
+
+
+def test_a_cropped_camera_sees_the_same_at_shifted_pixels() -> None:
+    camera = static_camera(intrinsics_from_fov(64, 48, 60.0), 2, 64, 48)
+    rows, columns = slice(5, 20), slice(12, 50)
+    cropped = camera.cropped(rows, columns)
+    points = torch.tensor([[0.1, -0.2, 2.0], [-0.4, 0.3, 1.5]])
+    whole, part = (project(points, each.intrinsics[1]) for each in (camera, cropped))
+    torch.testing.assert_close(part[0], whole[0] - torch.tensor([12.0, 5.0]))
+    assert (cropped.width, cropped.height) == (38, 15)
+    assert camera.intrinsics[0, 0, 2] == 32, "the camera itself is not changed"

@@ -27,23 +27,26 @@ def test_the_pixels_that_are_compared_are_those_of_the_whole_picture(
     corner = torch.zeros_like(priors.instances)
     corner[:, :4, :4] = 1
     focus = Focus(scene, view, replace(priors, instances=corner), scene.device)
-    part, where = focus(scene, frame)
+    look = focus(scene, frame)
+    part, crop = look.scene, (slice(None), look.rows, look.columns)
+    where = torch.zeros(1, view.camera.height, view.camera.width, dtype=torch.bool)
+    where[crop] = look.where
     assert bool(where[0, :4, :4].all()), "what the masks say moves"
     camera, when = view.camera.select([frame]), torch.tensor([frame])
     whole = render_scene(scene, camera, when)
     assert bool(where[whole.moving > 0.5].all()), "what moves by its motion"
     assert 0 < len(part.static) < len(scene.static)
     assert not where.all()
-    seen = render_scene(part, camera, when)
-    torch.testing.assert_close(seen.rgb[where], whole.rgb[where], atol=1e-5, rtol=0)
-    torch.testing.assert_close(seen.depth[where], whole.depth[where], atol=1e-4, rtol=0)
+    seen = render_scene(part, camera.cropped(look.rows, look.columns), when)
+    torch.testing.assert_close(seen.rgb[look.where], whole.rgb[where], atol=1e-5, rtol=0)
+    torch.testing.assert_close(seen.depth[look.where], whole.depth[where], atol=1e-4, rtol=0)
 
 
 def test_what_stands_still_is_left_alone_and_what_moves_is_not() -> None:
     scene = in_single(moving_cards())
     view, priors = recorded_in_single(moving_cards())
-    part, _ = Focus(scene, view, priors, scene.device)(replace(scene, static=_with_gradients(scene.static)), 1)
-    assert not part.static.means.requires_grad
+    look = Focus(scene, view, priors, scene.device)(replace(scene, static=_with_gradients(scene.static)), 1)
+    assert not look.scene.static.means.requires_grad
     one = FitConfig(steps=1, whole_every=10**6, held_out_frames=0, shadows=False, moving_gain_from=1.0)
 
     def fitted(settings: FitConfig):

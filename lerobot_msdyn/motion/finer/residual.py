@@ -23,6 +23,25 @@ _INVERTIBLE = 0.3  # smallest singular value of a blend that is inverted
 
 
 @dataclass(frozen=True)
+class _Followed:
+    """How much each track counts for each basis, and times the moments of its canonical point."""
+
+    shares: Float[Tensor, "n k"]
+    squares: Float[Tensor, "k n"]
+    moments: Float[Tensor, "k*4 n"]  # basis by basis: shares times 1, x, y, z ...
+    all_moments: Float[Tensor, "k*10 n"]  # ... and times the six products of two coordinates
+
+    @classmethod
+    def of(cls, shares: Float[Tensor, "n k"], x: Float[Tensor, "n 3"]) -> "_Followed":
+        """Of tracks at canonical points (m)."""
+        at = shares[..., None] * x[:, None]  # [n,k,3]
+        twice = at[..., _PAIRS[0]] * x[:, None, _PAIRS[1]]  # [n,k,6]
+        first = torch.cat((shares[..., None], at), dim=-1)
+        every = torch.cat((first, twice), dim=-1)
+        return cls(shares, shares.square().T, first.flatten(1).T, every.flatten(1).T)
+
+
+@dataclass(frozen=True)
 class ResidualTracks:
     """Tracks in the frame of the levels that are built already."""
 
@@ -87,13 +106,13 @@ def solve_residual(
     alone = torch.nn.functional.one_hot(label, count).double()
     mix = torch.zeros_like(alone).scatter_add_(1, indices, torch.softmax(logits, dim=-1).double())
     motions = torch.eye(4, dtype=x.dtype).repeat(count, y.shape[1], 1, 1)
-    for follows in [alone] * _ROUNDS + [mix] * _SWEEPS:
-        maps = (follows @ motions[..., :3, :].flatten(1)).reshape(n, y.shape[1], 3, 4)
+    for followed in [_Followed.of(alone, x)] * _ROUNDS + [_Followed.of(mix, x)] * _SWEEPS:
+        maps = (followed.shares @ motions[..., :3, :].flatten(1)).reshape(n, y.shape[1], 3, 4)
         miss = y - (maps[..., :3] @ x[:, None, :, None])[..., 0] - maps[..., 3]
         typical = _typical(miss.norm(dim=-1), seen > 0, label, count).clamp(min=max(noise, 1e-9))
         trusted = seen / (1 + (miss.norm(dim=-1) / (_NORMAL_MAD * typical)[label, None]).square()).square()
         sigma = typical / _MEDIAN_NORM
-        motions = _procrustes(x, miss, trusted, follows, motions, sigma if shrink else torch.zeros_like(sigma), turn)
+        motions = _procrustes(followed, miss, trusted, motions, sigma if shrink else torch.zeros_like(sigma), turn)
     return motions
 
 
@@ -156,10 +175,9 @@ def _apply(motions: Float[Tensor, "n t 4 4"], x: Float[Tensor, "n 3"]) -> Float[
 
 
 def _procrustes(
-    x: Float[Tensor, "n 3"],
+    followed: _Followed,
     miss: Float[Tensor, "n t 3"],
     weights: Float[Tensor, "n t"],
-    follows: Float[Tensor, "n k"],
     motions: Float[Tensor, "k t 4 4"],
     sigma: Float[Tensor, " k"],
     turn: bool,
@@ -169,23 +187,21 @@ def _procrustes(
     A rotation has the prior of a small turn (standard deviation _USUAL_TURN about each axis): to the second moment is
     added sigma^2 / (n turn^2) times the identity, sigma (m) being the noise along one axis and n the points behind it.
     """
-    count, frames = follows.shape[1], weights.shape[1]
-    at = follows[..., None] * x[:, None]  # [n,k,3]
-    twice = at[..., _PAIRS[0]] * x[:, None, _PAIRS[1]]  # [n,k,6]
-    moments = torch.cat((follows[..., None], at, twice), dim=-1).flatten(1).T @ weights
+    count, frames = followed.shares.shape[1], weights.shape[1]
+    moments = followed.all_moments @ weights
     total, x_mean, xx = moments.reshape(count, -1, frames).transpose(1, 2).split((1, 3, 6), dim=-1)
     safe = total.clamp(min=1e-12)
     x_mean, xx = x_mean / safe, (xx / safe)[..., _OF_PAIRS]
-    missed = torch.cat((follows[..., None], at), dim=-1).flatten(1).T @ (weights[..., None] * miss).flatten(1)
+    missed = followed.moments @ (weights[..., None] * miss).flatten(1)
     missed = missed.reshape(count, 4, frames, 3).permute(0, 2, 3, 1) / safe[..., None]
     miss_mean, miss_x = missed[..., 0], missed[..., 1:]
 
     old, shift = motions[..., :3, :3], motions[..., :3, 3]
     y_mean = (old @ x_mean[..., None])[..., 0] + shift + miss_mean
     spread = xx - x_mean[..., :, None] * x_mean[..., None, :]
-    rotation = torch.eye(3, dtype=x.dtype).expand(count, frames, 3, 3)
+    rotation = torch.eye(3, dtype=miss.dtype).expand(count, frames, 3, 3)
     if turn:
-        effective = total.square() / (follows.square().T @ weights.square())[..., None].clamp(min=1e-12)
+        effective = total.square() / (followed.squares @ weights.square())[..., None].clamp(min=1e-12)
         extent = torch.linalg.eigvalsh(spread).clamp(min=0).sqrt()
         fixed = (effective[..., 0] >= _MIN_EFFECTIVE) & (extent[..., 1] > _COLLINEAR * extent[..., 2])
         prior = (sigma[:, None] / _USUAL_TURN).square() / effective[..., 0].clamp(min=1)

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lerobot_msdyn.motion.from_tracks.rigid import RigidFit, fit_rigid, model_points, refine, residuals
+from lerobot_msdyn.render.cpu.threads import in_threads
 
 _SEEDS = 32  # rigid motions that are tried per instance
 _SEED_TRACKS = 16  # that propose one motion
@@ -42,11 +43,15 @@ def split_rigid_parts(
     of `pixel_m` metres each at the distance of what moves, explain nothing. Parts must be seen together for a while:
     tracks of one body that end before others begin are no two parts.
     """
-    part = torch.full_like(instance, -1)
-    for label in instance.unique():
-        rows = (instance == label).nonzero()[:, 0]
+
+    def parts_of(rows: Int[Tensor, " m"]) -> Int[Tensor, " m"]:
         weights = torch.where(valid, confidence.square(), 0)[rows]
-        part[rows] = _split(xyz[rows], weights, max_parts, _TOLERANCE_PX * pixel_m) + int(part.max()) + 1
+        return _split(xyz[rows], weights, max_parts, _TOLERANCE_PX * pixel_m)
+
+    part = torch.full_like(instance, -1)
+    instances = [(instance == label).nonzero()[:, 0] for label in instance.unique()]
+    for rows, own in zip(instances, in_threads(parts_of, instances), strict=True):
+        part[rows] = own + int(part.max()) + 1
     return part
 
 

@@ -114,6 +114,11 @@ def in_threads[A, B](
             torch.set_num_threads(before)
 
 
+def each_on[A, B](device: torch.device, function: Callable[[A], B], items: Iterable[A]) -> Iterator[B]:
+    """What a function of tensors on a device makes of each item: `in_threads`, or one by one on a GPU."""
+    return in_threads(function, items) if device.type == "cpu" else map(function, items)
+
+
 def begun[A, B](function: Callable[[A], B], items: Iterable[A], helpers: int) -> list[Callable[[], B]]:
     """Calls that each give what a function makes of an item; so many threads begin to work on them, in order.
 
