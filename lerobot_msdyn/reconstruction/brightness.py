@@ -1,5 +1,6 @@
 """How brightness changes over time: of the static set by the video alone, of the moving set by a rendered scene."""
 
+import contextlib
 import functools
 from collections import deque
 from dataclasses import dataclass
@@ -59,15 +60,15 @@ def static_shading(scene: DynamicScene, view: View, priors: Priors, empty: UInt8
         def sums_of(frame: int) -> Float32[ndarray, "a b 3"]:
             return _rendered_sums(scene, view, priors, frame, around)
 
-    coming = in_threads(sums_of, range(frames))
-    sums = deque(islice(coming, 2), maxlen=3)  # of a frame and those beside it
     fields = []
-    for t in range(frames):
-        fields.append(encode_gain(torch.from_numpy(_ratio(np.sum(sums, axis=0)))))
-        if t + 2 < frames:
-            sums.append(next(coming))
-        elif t > 0:
-            sums.popleft()
+    with contextlib.closing(in_threads(sums_of, range(frames))) as coming:
+        sums = deque(islice(coming, 2), maxlen=3)  # of a frame and those beside it
+        for t in range(frames):
+            fields.append(encode_gain(torch.from_numpy(_ratio(np.sum(sums, axis=0)))))
+            if t + 2 < frames:
+                sums.append(next(coming))
+            elif t > 0:
+                sums.popleft()
     return Shading(torch.stack(fields), places, no_shading(0, len(scene.moving), frames).moving)
 
 

@@ -40,7 +40,7 @@ class FitStep:
     scene: DynamicScene  # as it is optimised; its tensors carry gradients
     frames: Int[Tensor, " b"]  # that are compared
     rendering: Rendering  # of these frames, through the recorded camera; carries gradients
-    targets: Targets
+    targets: Targets  # in the rows and columns that are rendered
     random: torch.Generator  # for terms that draw; on the host
     backend: str = "auto"  # of the rasterizer, for terms that render
     where: Bool[Tensor, "b h w"] | None = None  # pixels that are rendered whole, and compared; none: all

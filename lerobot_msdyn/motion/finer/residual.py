@@ -23,6 +23,23 @@ _INVERTIBLE = 0.3  # smallest singular value of a blend that is inverted
 
 
 @dataclass(frozen=True)
+class ResidualTracks:
+    """Tracks in the frame of the levels that are built already."""
+
+    points: Float[Tensor, "n 3"]  # m, at the canonical frame
+    positions: Float[Tensor, "n t 3"]  # m; meaningless where the weight is 0
+    weights: Float[Tensor, "n t"]  # 0 = not seen
+    part: Int[Tensor, " n"]
+    owner: Int[Tensor, " n"]  # basis of the last level built, among whose tracks each was
+
+    def select(self, rows: Tensor) -> "ResidualTracks":
+        """Some of the tracks."""
+        return ResidualTracks(
+            self.points[rows], self.positions[rows], self.weights[rows], self.part[rows], self.owner[rows]
+        )
+
+
+@dataclass(frozen=True)
 class _Followed:
     """How much each track counts for each basis, and times the moments of its canonical point."""
 
@@ -39,23 +56,6 @@ class _Followed:
         first = torch.cat((shares[..., None], at), dim=-1)
         every = torch.cat((first, twice), dim=-1)
         return cls(shares, shares.square().T, first.flatten(1).T, every.flatten(1).T)
-
-
-@dataclass(frozen=True)
-class ResidualTracks:
-    """Tracks in the frame of the levels that are built already."""
-
-    points: Float[Tensor, "n 3"]  # m, at the canonical frame
-    positions: Float[Tensor, "n t 3"]  # m; meaningless where the weight is 0
-    weights: Float[Tensor, "n t"]  # 0 = not seen
-    part: Int[Tensor, " n"]
-    owner: Int[Tensor, " n"]  # basis of the last level built, among whose tracks each was
-
-    def select(self, rows: Tensor) -> "ResidualTracks":
-        """Some of the tracks."""
-        return ResidualTracks(
-            self.points[rows], self.positions[rows], self.weights[rows], self.part[rows], self.owner[rows]
-        )
 
 
 def cluster_places(

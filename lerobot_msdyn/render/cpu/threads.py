@@ -10,7 +10,7 @@ workers), or that which it had before `torch_on_one_thread`.
 import contextlib
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import ContextVar
 from functools import cache, partial
@@ -79,7 +79,7 @@ def in_threads[A, B](
     items: Iterable[A],
     at_once: int | None = None,
     stop: Callable[[], object] = lambda: None,
-) -> Iterator[B]:
+) -> Generator[B]:
     """What a function makes of each item, in their order, on as many threads as this process may use.
 
     Torch, NumPy, OpenCV and the kernels let others run while they compute; within the function each has one thread, or
