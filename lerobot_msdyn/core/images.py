@@ -32,19 +32,19 @@ def masked_median(
     return np.where(count > 0, (low + high) / 2, np.float32(0))
 
 
-def box_about(region: Bool[ndarray, "h w"], least: int = 1) -> tuple[slice, slice]:
-    """Rows and columns of the smallest box about a region with a margin of 16 px, at least `least` px to a side.
+def box_about(region: Bool[ndarray, "h w"], least: int = 1, margin: int = MARGIN_PX) -> tuple[slice, slice]:
+    """Rows and columns of the smallest box about a region with a margin (px), at least `least` px to a side.
 
     It ends at the image's edges. About nothing it is empty.
     """
     if not region.any():
         return slice(0, 0), slice(0, 0)
     rows, columns = np.flatnonzero(region.any(1)), np.flatnonzero(region.any(0))
-    return _extent(rows, region.shape[0], least), _extent(columns, region.shape[1], least)
+    return _extent(rows, region.shape[0], least, margin), _extent(columns, region.shape[1], least, margin)
 
 
-def _extent(index: ndarray, size: int, least: int) -> slice:
-    first, last = int(index[0]) - MARGIN_PX, int(index[-1]) + 1 + MARGIN_PX
+def _extent(index: ndarray, size: int, least: int, margin: int) -> slice:
+    first, last = int(index[0]) - margin, int(index[-1]) + 1 + margin
     first, last = max(0, first), min(size, last)
     length = min(size, max(least, last - first))
     first = min(max(0, (first + last - length) // 2), size - length)

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from lerobot_msdyn.core.config import FitConfig
+from lerobot_msdyn.core.images import box_about
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.core.sampling import scaled_window
 from lerobot_msdyn.core.visibility import projected
@@ -20,6 +21,7 @@ from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.footprints import footprints
 
 AROUND_PX = 8  # of 320: about what moves, by mask or by motion, that is looked at as well
+ONE_PIXEL = slice(0, 1), slice(0, 1)  # is rendered where there is nothing to look at
 BY_PIXEL = {"rgb", "depth", "mask"}  # loss terms that leave out pixels that are not looked at
 
 
@@ -56,9 +58,11 @@ class Focus:
             moved = projected(scene.positions(torch.tensor([frame]))[0, len(scene.static) :], camera)
             row, column = (index[moved.inside].numpy() for index in moved.pixel)
             moving[row, column] = 1
-            regions.append(torch.from_numpy(cv2.dilate(moving, window) > 0))
-        self._crops = [_around(region) for region in regions]
-        self._regions = torch.stack(regions).to(device)
+            regions.append(cv2.dilate(moving, window) > 0)
+        self._crops: list[tuple[slice, slice]] = [
+            box_about(region, margin=0) if region.any() else ONE_PIXEL for region in regions
+        ]
+        self._regions = torch.from_numpy(np.stack(regions)).to(device)
         self._shown: dict[int, Int[Tensor, " n"]] = {}  # by frame, the static Gaussians that its region may show
 
     @classmethod
@@ -85,9 +89,3 @@ class Focus:
                 self._shown[frame] = self._still.may_cover(region.numpy()).nonzero()[:, 0]
             rows = self._shown[frame]
         return Look(scene.select_static(rows), *crop, region[None][:, *crop])
-
-
-def _around(region: Bool[Tensor, "h w"]) -> tuple[slice, slice]:
-    """The rows and columns of a region; of an empty one the first of each."""
-    rows, columns = (region.any(axis).nonzero()[:, 0].tolist() or [0] for axis in (1, 0))
-    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)

@@ -35,6 +35,8 @@ def test_the_pixels_that_are_compared_are_those_of_the_whole_picture(
     camera, when = view.camera.select([frame]), torch.tensor([frame])
     whole = render_scene(scene, camera, when)
     assert bool(where[whole.moving > 0.5].all()), "what moves by its motion"
+    for axis in (1, 2):
+        assert look.where.any(axis)[0, [0, -1]].all(), "no row or column more is rendered"
     assert 0 < len(part.static) < len(scene.static)
     assert not where.all()
     seen = render_scene(part, camera.cropped(look.rows, look.columns), when)
@@ -57,6 +59,21 @@ def test_what_stands_still_is_left_alone_and_what_moves_is_not() -> None:
     often, once = fitted(replace(one, steps=4)), fitted(one)
     assert (often.static.sh - once.static.sh).abs().max() == 0, "only the first step is a look at the whole"
     assert (often.moving.sh - once.moving.sh).abs().max() > 1e-3
+
+
+def test_frames_at_which_nothing_is_seen_to_move_change_nothing() -> None:
+    scene = in_single(moving_cards())
+    view, priors = recorded_in_single(moving_cards())
+    nothing = replace(priors, instances=torch.zeros_like(priors.instances), depth_traits=ROUGH)
+    aside = replace(scene, moving=replace(scene.moving, means=scene.moving.means + torch.tensor([50.0, 0.0, 0.0])))
+    look = Focus(aside, view, nothing, scene.device)(aside, 1)
+    assert not look.where.any()
+    one = FitConfig(steps=1, whole_every=10**6, held_out_frames=0, shadows=False, moving_gain_from=1.0)
+    once, often = (
+        fit(aside, view, nothing, settings, empty=view.rgb[0], distance=1.0, seed=0).scene
+        for settings in (one, replace(one, steps=3))
+    )
+    assert torch.equal(once.moving.means, often.moving.means)
 
 
 @pytest.mark.parametrize(
