@@ -297,6 +297,11 @@ class LearnConfig:
     # pixels (median, of pictures 320 wide); 0: all bases at the full rate, also those that no track follows.
     sure_px: float = between(0.0, 0, INFINITY)
 
+    @property
+    def motion(self) -> bool:
+        """Whether anything of the motion is."""
+        return self.bases or self.weights
+
 
 @dataclass
 class DensityConfig:

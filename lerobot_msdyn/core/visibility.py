@@ -1,6 +1,7 @@
 """Where points land in a picture, and whether it shows them: the one way to ask."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -20,13 +21,13 @@ class Projection:
     width: int
     height: int
 
-    @property
+    @cached_property
     def inside(self) -> Bool[Tensor, " n"]:
         """Which are in front of the camera and inside of its picture."""
         x, y = self.xy.unbind(-1)
         return (self.z > 0) & (x >= 0) & (y >= 0) & (x < self.width) & (y < self.height)
 
-    @property
+    @cached_property
     def pixel(self) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"]]:
         """Row and column of the pixel of each; of the nearest one of the border where a point is outside."""
         return nearest_pixel(self.xy, self.width, self.height)

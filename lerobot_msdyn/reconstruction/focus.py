@@ -71,7 +71,7 @@ class Focus:
 
         Where depth is measured, less of a look at what stands still is seen from other cameras (0.1 to 0.2 dB).
         """
-        learns = config.learn.bases or config.learn.weights or config.density.enabled
+        learns = config.learn.motion or config.density.enabled
         terms = {name for name, weight in config.weights.items() if weight > 0}
         suffices = view.camera.is_static and not priors.depth_traits.measured
         return config.whole_every > 1 and suffices and not learns and terms <= BY_PIXEL

@@ -83,7 +83,6 @@ def short_lived_of(scene: DynamicScene, view: View, priors: Priors, reach: int, 
         hidden=packed_rows([torch.zeros(own, dtype=torch.bool)] * count),
     )
     with_them = replace(host, short_lived=unhidden)
-    moving = torch.arange(own) >= len(scene.static)
 
     def hidden(frame: int) -> Bool[Tensor, " g"]:
         if frame in keys:
@@ -91,7 +90,8 @@ def short_lived_of(scene: DynamicScene, view: View, priors: Priors, reach: int, 
         patch = with_them.short_lived_patch(frame)
         assert patch is not None
         covered = torch.from_numpy(_covered(patch.means, comparison, frame) & wrong[frame])
-        return comparison.hidden(scene.positions(torch.tensor([frame]))[0], moving, frame, covered, covered)
+        moving = scene.positions(torch.tensor([frame]))[0, len(scene.static) :]
+        return comparison.hidden(moving, frame, covered, covered)
 
     found = replace(unhidden, hidden=packed_rows([*each_on(scene.device, hidden, range(count))]))
     each = len(found.shown) / max(len(found.means), 1)
@@ -137,7 +137,7 @@ def _carried(
     host: DynamicScene, snapshot: Snapshot, patch: FramePatch, key: int
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 4"], Int[Tensor, " n"]]:
     """Canonical positions (m) and orientations of the Gaussians of a frame, each by the nearest of the moving set."""
-    means, quats = snapshot.means[0, len(host.static) :], snapshot.quats[0, len(host.static) :]
+    means, quats = snapshot.means[0], snapshot.quats[0]
     carrier = torch.from_numpy(cKDTree(means.numpy()).query(patch.means.numpy())[1])
     turned = quaternion_multiply(quats[carrier], quaternion_conjugate(host.moving.quats[carrier]))
     turned = torch.nn.functional.normalize(turned, dim=-1)

@@ -131,7 +131,7 @@ class Draft:
 
     def made(self) -> "Made":
         """What all steps have made, on the host."""
-        scene, evidence = to_device((self.scene, self.evidence), "cpu")
+        scene, evidence = to_device((self.scene.decomposed(), self.evidence), "cpu")
         fitted, priors = self.fitted, self.priors
         window = FittedWindow(
             self.start, scene, evidence, self.self_check, fitted.steps, fitted.train_psnr_db, self.seconds
@@ -200,8 +200,9 @@ def _fit(draft: Draft) -> None:
     config = draft.recipe.fit
     if draft.shared is not None and draft.shared.static is not None:
         config = replace(config, steps=round(FURTHER_STEPS * config.steps))
+    scene = to_device(draft.scene, draft.device)
     draft.fitted = fit(
-        to_device(draft.scene, draft.device),
+        scene if config.learn.motion else scene.composed(),
         draft.view,
         draft.priors,
         config,

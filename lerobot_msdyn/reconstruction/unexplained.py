@@ -15,13 +15,14 @@ from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.core.sampling import scaled_px
 from lerobot_msdyn.core.serialise import to_device
-from lerobot_msdyn.core.visibility import projected
+from lerobot_msdyn.core.visibility import Projection, projected
 from lerobot_msdyn.priors import Priors
 from lerobot_msdyn.reconstruction.background import fill_depth, pixel_gaussians
 from lerobot_msdyn.scene.dynamic import DynamicScene, Snapshot, patched
-from lerobot_msdyn.scene.footprints import footprints
+from lerobot_msdyn.scene.footprints import Footprints, footprints
 from lerobot_msdyn.scene.overlay import FramePatch
 from lerobot_msdyn.scene.rendering import Rendering, render_scene, render_snapshot
+from lerobot_msdyn.scene.still_view import StillView
 
 COLOUR_ERROR = 0.06  # mean absolute difference of colours 0..1, over about a pixel, beyond which one is not explained
 DEPTH_ERROR = 0.02  # relative difference of depths beyond which it is not, at least
@@ -32,6 +33,37 @@ SCALE = 0.7  # of a pixel's Gaussian: its neighbours are rendered as well
 ERROR_AROUND = 0.04  # the same over several pixels of the moving set, all of which it then condemns
 SMOOTH_PX, _AROUND_PX = 1.0, 8.0  # standard deviations of these averages, at a width of 320
 _BESIDE = np.ones((3, 3), np.uint8)  # a pixel and those beside it
+
+
+@dataclass(frozen=True)
+class _Static:
+    """The static set of a scene (on any device) before one pose of the recorded camera."""
+
+    scene: DynamicScene
+    camera: CameraTrack  # of one pose, on the device of the scene
+    backend: str
+    once: bool  # whether one picture sees it from there, or many
+
+    @cached_property
+    def view(self) -> StillView:
+        """For pictures."""
+        return self.scene.still_view(self.camera, self.backend, once=self.once)
+
+    @cached_property
+    def seen(self) -> Projection:
+        """Where its centres are seen; on the host."""
+        return projected(*to_device((self.scene.static.means, self.camera), "cpu"))
+
+    @cached_property
+    def prints(self) -> Footprints:
+        """What its Gaussians may cover."""
+        return footprints(self.scene.static.means, self.scene.static.scales.amax(-1), self.camera)
+
+    @cached_property
+    def depth(self) -> Float[ndarray, "h w"]:
+        """Of what stands still (m)."""
+        frame, alone = torch.tensor([0]), self.scene.still()
+        return render_scene(alone, self.camera, frame, self.backend, still=self.view).depth[0].cpu().numpy()
 
 
 @dataclass(frozen=True)
@@ -54,9 +86,9 @@ class Comparison:
         return fill_depth(self.priors.depth[frame])
 
     def snapshot(self, frame: int) -> Snapshot:
-        """The two sets of the scene as the recorded camera sees them."""
+        """The moving set of the scene as the recorded camera sees it, before the static one."""
         camera, when = self._pose(frame), to_device(torch.tensor([frame]), self.scene.device)
-        return self.scene.at(when, camera.world_from_camera[:, :3, 3])
+        return self.scene.at(when, camera.world_from_camera[:, :3, 3], self._static(frame).view.at(when))
 
     def wrong(self, snapshot: Snapshot, frame: int) -> Bool[ndarray, "h w"]:
         """Where the picture of a snapshot has another colour or depth than the recorded one."""
@@ -66,8 +98,7 @@ class Comparison:
 
     def taken(self, wrong: Bool[ndarray, "h w"], frame: int) -> Bool[ndarray, "h w"]:
         """Those of the wrong pixels whose recorded colour is that of one surface."""
-        still = self._fixed_still_depth if self.view.camera.is_static else self._still_depth(frame)
-        return wrong & ~_behind_an_edge(self.depth(frame).numpy(), still)
+        return wrong & ~_behind_an_edge(self.depth(frame).numpy(), self._static(frame).depth)
 
     def patch(
         self, snapshot: Snapshot, frame: int, wrong: Bool[ndarray, "h w"], taken: Bool[ndarray, "h w"]
@@ -80,13 +111,14 @@ class Comparison:
         """
         picture, depth, chosen = self.view.rgb[frame], self.depth(frame), torch.from_numpy(taken)
         pixels = pixel_gaussians(picture, depth, self.view.camera, frame, where=chosen)[0]
-        hidden = self.hidden(snapshot.means[0], snapshot.moving > 0, frame, torch.from_numpy(wrong), chosen)
+        hidden = self.hidden(snapshot.means[0], frame, torch.from_numpy(wrong), chosen)
         log_scales, recorded = pixels.log_scales + math.log(SCALE), picture[chosen].float() / 255
         first = FramePatch(pixels.means, pixels.quats, log_scales, recorded, hidden)
         if len(first) == 0:
             return first
         camera = self._pose(frame)
-        beside = footprints(snapshot.means[0], snapshot.scales.amax(-1), camera).may_cover(taken)  # all that these show
+        prints = self._static(frame).prints, footprints(snapshot.means[0], snapshot.scales.amax(-1), camera)
+        beside = torch.cat([each.may_cover(taken) for each in prints])  # all that these pixels show
         alone = to_device(replace(first, hidden=hidden | ~beside.cpu()), snapshot.means.device)
         shown = patched(snapshot, alone)
         rendered = render_snapshot(shown, camera, self.scene.near, self.backend).rgb[0].cpu()[chosen]
@@ -95,31 +127,29 @@ class Comparison:
         return replace(first, rgb=(recorded + lacking).clamp(0, 1.5))
 
     def hidden(
-        self,
-        means: Float[Tensor, "g 3"],
-        moving: Bool[Tensor, " g"],
-        frame: int,
-        wrong: Bool[Tensor, "h w"],
-        taken: Bool[Tensor, "h w"],
+        self, moving: Float[Tensor, "m 3"], frame: int, wrong: Bool[Tensor, "h w"], taken: Bool[Tensor, "h w"]
     ) -> Bool[Tensor, " g"]:
-        """Gaussians on or before the recorded surface: moving ones where it is wrong, others where it is replaced."""
-        means, moving = to_device((means, moving), "cpu")
-        seen = projected(means, self.view.camera.select([frame]))
-        replaced = torch.where(moving, wrong[seen.pixel], taken[seen.pixel])
-        return replaced & seen.visible(self.depth(frame), THICKNESS)
+        """Gaussians on or before the recorded surface: moving ones where it is wrong, static ones where it is replaced.
+
+        The static ones come first; the moving ones are at some places (m).
+        """
+        depth, still = self.depth(frame), self._static(frame).seen
+        seen = projected(moving.cpu(), self.view.camera.select([frame]))
+        where = taken[still.pixel], wrong[seen.pixel]
+        return torch.cat((where[0] & still.visible(depth, THICKNESS), where[1] & seen.visible(depth, THICKNESS)))
 
     def _pose(self, frame: int) -> CameraTrack:
         return to_device(self.view.camera.select([frame]), self.scene.device)
 
-    def _still_depth(self, frame: int) -> Float[ndarray, "h w"]:
-        """Of what stands still (m)."""
-        frames, camera = torch.tensor([frame]), self.view.camera.select([frame])
-        return render_scene(self.scene.still(), camera, frames, self.backend).depth[0].cpu().numpy()
+    def _static(self, frame: int) -> _Static:
+        if self.view.camera.is_static:
+            return self._fixed
+        return _Static(self.scene, self._pose(frame), self.backend, once=True)
 
     @cached_property
-    def _fixed_still_depth(self) -> Float[ndarray, "h w"]:
-        """Before a fixed camera, rendered once."""
-        return self._still_depth(0)
+    def _fixed(self) -> _Static:
+        """What a fixed camera sees of it, worked out once."""
+        return _Static(self.scene, self._pose(0), self.backend, once=False)
 
 
 def wrong_pixels(

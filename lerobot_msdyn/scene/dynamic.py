@@ -8,18 +8,22 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.serialise import named_tensors
 from lerobot_msdyn.motion.model.compose import Level, compose, compose_points
+from lerobot_msdyn.motion.model.composed import ComposedLevel, composed_level
+from lerobot_msdyn.render import Painted
 from lerobot_msdyn.scene.gaussians import Gaussians
 from lerobot_msdyn.scene.overlay import PATCH_OPACITY, FramePatch, Overlay
 from lerobot_msdyn.scene.seen import shaded_moving
 from lerobot_msdyn.scene.shading import Shading
 from lerobot_msdyn.scene.short_lived import STILL, ShortLived
+from lerobot_msdyn.scene.still_view import StillView, still_view
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """All Gaussians of a scene at some frames, ready to be rasterized: the static ones first."""
+    """All Gaussians of a scene at some frames, ready to be rasterized: the static ones first, or as a backdrop."""
 
     means: Float[Tensor, "b g 3"]
     quats: Float[Tensor, "b g 4"]
@@ -28,12 +32,17 @@ class Snapshot:
     rgb: Float[Tensor, "b g 3"]
     moving: Float[Tensor, " g"]  # 1 for the moving set, 0 for the static one
     extra: Float[Tensor, " g"] | None = None  # another value of each
+    backdrop: Painted | None = None  # the static set with its colours, if it is not among the others
 
 
 def patched(snapshot: Snapshot, patch: FramePatch) -> Snapshot:
     """A snapshot of one frame, with a patch in place of what the patch hides; the patch counts as moving."""
     ones = patch.means.new_ones(len(patch))
-    left = torch.where(patch.hidden, 0.0, snapshot.opacities)  # less to copy than without what is hidden
+    backdrop, hidden = snapshot.backdrop, patch.hidden
+    if backdrop is not None:
+        behind = len(backdrop.backdrop)
+        backdrop, hidden = replace(backdrop, hidden=backdrop.hidden | hidden[:behind]), hidden[behind:]
+    left = torch.where(hidden, 0.0, snapshot.opacities)  # less to copy than without what is hidden
     return Snapshot(
         means=torch.cat((snapshot.means, patch.means[None]), dim=1),
         quats=torch.cat((snapshot.quats, patch.quats[None]), dim=1),
@@ -42,6 +51,7 @@ def patched(snapshot: Snapshot, patch: FramePatch) -> Snapshot:
         rgb=torch.cat((snapshot.rgb, patch.rgb[None]), dim=1),
         moving=torch.cat((snapshot.moving, ones)),
         extra=None if snapshot.extra is None else torch.cat((snapshot.extra, ones)),
+        backdrop=backdrop,
     )
 
 
@@ -102,9 +112,29 @@ class DynamicScene:
         indices, logits = self.followed_by(which)
         return replace(self, moving=self.moving.select(which), indices=indices, logits=logits, shading=shading)
 
+    def composed(self) -> "DynamicScene":
+        """The same, on the CPU with its levels as one, which remembers frames; where they are learned, as it is."""
+        level = composed_level(self.levels, self.indices, self.logits)
+        if level is None:
+            return self
+        numbers = torch.arange(len(self.moving))[:, None]
+        return replace(self, levels=(level,), indices=(numbers,), logits=(torch.zeros(len(numbers), 1),))
+
+    def decomposed(self) -> "DynamicScene":
+        """The same with its levels one by one."""
+        if len(self.levels) != 1 or not isinstance(self.levels[0], ComposedLevel):
+            return self
+        level, rows = self.levels[0], self.indices[0][:, 0]
+        indices, logits = (tuple(each[rows] for each in kind) for kind in (level.indices, level.logits))
+        return replace(self, levels=level.levels, indices=indices, logits=logits)
+
     def still(self) -> "DynamicScene":
         """The same without what moves and without patches: the static set, its brightness and the near plane."""
         return replace(self.select_moving(slice(0)).without_patches(), levels=(), indices=(), logits=())
+
+    def still_view(self, camera: CameraTrack, backend: str = "auto", *, once: bool = False) -> StillView:
+        """The static set before the first pose of a camera (on its device), for `once` or for many pictures."""
+        return still_view(self.static, self.shading, camera, self.near, backend, once=once)
 
     def without_patches(self) -> "DynamicScene":
         """What its two sets alone show."""
@@ -150,14 +180,25 @@ class DynamicScene:
         """Indices and logits per level of some of the moving set."""
         return tuple(rows[which] for rows in self.indices), tuple(rows[which] for rows in self.logits)
 
-    def at(self, frames: Int[Tensor, " b"], eye: Float[Tensor, "b 3"] | None = None) -> Snapshot:
+    def at(
+        self,
+        frames: Int[Tensor, " b"],
+        eye: Float[Tensor, "b 3"] | None = None,
+        backdrop: Painted | None = None,
+    ) -> Snapshot:
         """The scene at some frames, differentiable in all Gaussians and bases.
 
         Args:
             frames: the frames.
             eye: from where it is seen at each (m), for colours that depend on it; without, their means are given.
+            backdrop: what its static set shows there, which is left out then.
         """
-        static, moving, frames = self.static, self.moving, frames.to(self.device)
+        frames = frames.to(self.device)
+        if backdrop is not None:
+            with torch.no_grad():  # else the static set has gradients of zero
+                others = self.select_static(slice(0))
+            return replace(others.at(frames, eye), backdrop=backdrop)
+        static, moving = self.static, self.moving
         means, quats = compose(moving.means, moving.quats, self.levels, self.indices, self.logits, frames)
         b = len(frames)
         return Snapshot(
@@ -192,7 +233,8 @@ class DynamicScene:
         moving = self.moving.rgb.expand(len(frames), -1, -1)
         if eye is not None and self.moving.sh.shape[1] > 1:
             moving = shaded_moving(self.moving.sh, self.moving.quats, quats, means, eye)
-        if self.shading is not None:
+        if self.shading is not None and len(self.static) > 0:
             static = static * self.shading.static_gain(frames)[..., None]
+        if self.shading is not None:
             moving = moving * self.shading.moving_gain(frames)[..., None]
         return torch.cat((static, moving), dim=1)

@@ -13,6 +13,7 @@ from lerobot_msdyn.render import Raster, rasterize
 from lerobot_msdyn.render.cpu.threads import torch_on_one_thread
 from lerobot_msdyn.scene.dynamic import DynamicScene, Snapshot, patched, patched_together
 from lerobot_msdyn.scene.overlay import FramePatch
+from lerobot_msdyn.scene.still_view import StillView
 
 _FAINT = 1e-6  # opacity by which nothing is divided
 
@@ -34,20 +35,21 @@ def render_scene(
     frames: Tensor,
     backend: str = "auto",
     extra: Float[Tensor, " m"] | None = None,
+    still: StillView | None = None,
 ) -> Rendering:
     """The scene at `frames` (int, [b]) through the b poses of `camera`; differentiable.
 
-    `extra` is a value per moving Gaussian to be rendered as well; patches have one of 1. Runs on the scene's
-    device; frames and camera may be on the host.
+    `extra` is a value per moving Gaussian to be rendered as well; patches have one of 1. `still` is the scene's static
+    set before this camera, where it keeps still. Runs on the scene's device; frames and camera may be on the host.
     """
     if scene.overlay is None and scene.short_lived is None:
         camera, frames = to_device((camera, frames), scene.device)
-        return render_snapshot(_snapshot(scene, camera, frames, extra), camera, scene.near, backend)
+        return render_snapshot(_snapshot(scene, camera, frames, extra, still), camera, scene.near, backend)
     patches = [patch for frame in frames.tolist() if (patch := scene.patch(frame)) is not None]
     if scene.device.type != "cpu":
         return render_patched_together(scene, camera, frames, patches, backend, extra)
     parts = [
-        render_patched(scene, camera.select([i]), frame, patch, backend, extra)
+        render_patched(scene, camera.select([i]), frame, patch, backend, extra, still)
         for i, (frame, patch) in enumerate(zip(frames.tolist(), patches, strict=True))
     ]
     if len(parts) == 1:
@@ -63,10 +65,11 @@ def render_patched(
     patch: FramePatch,
     backend: str = "auto",
     extra: Float[Tensor, " m"] | None = None,
+    still: StillView | None = None,
 ) -> Rendering:
     """The scene at one frame through one pose, with a patch in place of what the patch hides."""
     camera, when, patch = to_device((camera, torch.tensor([frame]), patch), scene.device)
-    return render_snapshot(patched(_snapshot(scene, camera, when, extra), patch), camera, scene.near, backend)
+    return render_snapshot(patched(_snapshot(scene, camera, when, extra, still), patch), camera, scene.near, backend)
 
 
 def render_patched_together(
@@ -83,16 +86,27 @@ def render_patched_together(
     return render_snapshot(snapshot, camera, scene.near, backend)
 
 
-def _snapshot(scene: DynamicScene, camera: CameraTrack, frames: Tensor, extra: Float[Tensor, " m"] | None) -> Snapshot:
-    snapshot = scene.at(frames, camera.world_from_camera[:, :3, 3])
+def _snapshot(
+    scene: DynamicScene,
+    camera: CameraTrack,
+    frames: Tensor,
+    extra: Float[Tensor, " m"] | None,
+    still: StillView | None = None,
+) -> Snapshot:
+    backdrop = None if still is None else still.at(frames)
+    snapshot = scene.at(frames, camera.world_from_camera[:, :3, 3], backdrop)
     if extra is None:
         return snapshot
-    return replace(snapshot, extra=torch.cat((extra.new_zeros(len(scene.static)), extra)))
+    none = extra.new_zeros(len(scene.static) if backdrop is None else 0)
+    return replace(snapshot, extra=torch.cat((none, extra)))
 
 
 def render_snapshot(snapshot: Snapshot, camera: CameraTrack, near: float, backend: str = "auto") -> Rendering:
     """What one pose per frame of a snapshot sees of it; all on one device."""
     values = [snapshot.moving] if snapshot.extra is None else [snapshot.moving, snapshot.extra]
+    backdrop = snapshot.backdrop
+    if backdrop is not None:
+        backdrop = replace(backdrop, plain=torch.nn.functional.pad(backdrop.plain, (0, len(values))))
     raster: Raster = rasterize(
         snapshot.means,
         snapshot.quats,
@@ -105,6 +119,7 @@ def render_snapshot(snapshot: Snapshot, camera: CameraTrack, near: float, backen
         camera.height,
         near=near,
         backend=backend,
+        backdrop=backdrop,
     )
     rgb, moving, *more = raster.features.split([3] + [1] * len(values), dim=-1)
     return Rendering(rgb, raster.depth, raster.alpha, moving[..., 0], more[0][..., 0] if more else None)
@@ -147,11 +162,12 @@ def render_frames(
     batch: int = 8,
     backend: str = "auto",
     extra: Float[Tensor, " m"] | None = None,
+    still: StillView | None = None,
 ) -> Iterator[Rendering]:
     """The whole scene in batches of frames, so that memory stays bounded; `frames` (int, [t]) defaults to all."""
     frames = torch.arange(scene.frames) if frames is None else frames
     for start in range(0, len(frames), batch):
         part = slice(start, min(start + batch, len(frames)))
         with torch_on_one_thread():
-            rendered = render_scene(scene, camera.select(part), frames[part], backend, extra)
+            rendered = render_scene(scene, camera.select(part), frames[part], backend, extra, still)
         yield rendered

@@ -17,6 +17,7 @@ from lerobot_msdyn.reconstruction.result import FittedWindow, Reconstruction
 from lerobot_msdyn.render.cpu.threads import each_on
 from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.rendering import Rendering, render_frames
+from lerobot_msdyn.scene.still_view import StillView
 from lerobot_msdyn.views.coverage import Coverage, Looked, coverage_of, looked
 from lerobot_msdyn.views.filling import filled, missing
 
@@ -32,6 +33,7 @@ Rendered = tuple[Rendering, list[Coverage], Float[Tensor, "#t #h #w 3"]]  # fram
 class _Still:
     """What stands still through a fixed camera, the same for all frames: nothing flickers, and it is looked up once."""
 
+    view: StillView | None  # for all pictures; on a GPU, which projects many at a time, None
     filling: Float[Tensor, "1 h w 3"] | None  # with its holes filled
     looked: Looked
 
@@ -143,7 +145,8 @@ def _some_made[T](
     """What is made of a batch of a window's frames."""
     poses = camera.select(batch)
     every = window.evidence.moving_frames
-    rendering = next(render_frames(window.scene, poses, times[batch], batch=len(poses), extra=every))
+    view = None if still is None else still.view
+    rendering = next(render_frames(window.scene, poses, times[batch], batch=len(poses), extra=every, still=view))
     if fill == "none":
         behind = rendering.rgb.new_zeros(1, 1, 1, 3)
     elif still is None or still.filling is None:
@@ -159,9 +162,10 @@ def _still(window: FittedWindow, camera: CameraTrack, times: Tensor, fill: Fill)
     """What a fixed camera sees of what stands still, in the middle of its frames."""
     middle = [len(times) // 2]
     pose = camera.select(middle)
-    rendering = next(render_frames(window.scene.still(), pose, times[middle]))
+    view = window.scene.still_view(pose) if window.scene.device.type == "cpu" else None
+    rendering = next(render_frames(window.scene.still(), pose, times[middle], still=view))
     filling = None if fill == "none" else _filled(rendering, 0, fill)[None]
-    return _Still(filling, looked(rendering.depth[0], to_device(pose, rendering.depth.device), window.evidence))
+    return _Still(view, filling, looked(rendering.depth[0], to_device(pose, rendering.depth.device), window.evidence))
 
 
 def _filled(rendering: Rendering, i: int, fill: Fill) -> Float[Tensor, "h w 3"]:

@@ -15,7 +15,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_leaves
 
 import lerobot_msdyn
-from lerobot_msdyn.render import Raster
+from lerobot_msdyn.render import Painted, Raster
 
 _ANSWERS: dict[str, Callable[[Tensor], Any]] = {
     "__bool__": lambda _: True,
@@ -77,10 +77,11 @@ def _caller() -> str:
     return f"{frames[-1].filename.removeprefix(package + '/')} {frames[-1].name}" if frames else "test"
 
 
-def fake_rasterize(*arguments: Any, near: float, backend: str = "auto") -> Raster:
+def fake_rasterize(*arguments: Any, near: float, backend: str = "auto", backdrop: Painted | None = None) -> Raster:
     """In place of `rasterize`: as wide and as differentiable, of no meaning; all tensors must be on the fake GPU."""
     *tensors, width, height = arguments
-    assert {tensor.device.type for tensor in tensors} == {"cuda"}, [tensor.device for tensor in tensors]
+    behind = [] if backdrop is None else [backdrop.features, backdrop.opacities, backdrop.backdrop.means]
+    assert {each.device.type for each in (*tensors, *behind)} == {"cuda"}, [each.device for each in tensors]
     views, channels = len(tensors[5]), tensors[4].shape[-1]
     everything = torch.stack([tensor.sum() for tensor in tensors]).sum()
     image = everything.expand(views, height, width, channels + 2)

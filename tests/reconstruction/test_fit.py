@@ -43,6 +43,20 @@ def test_the_scene_that_was_given_is_not_changed() -> None:
     assert result.scene.levels is before.levels
 
 
+def test_levels_as_one_are_fitted_alike() -> None:
+    scene, (view, priors) = in_single(moving_cards()), recorded_in_single(moving_cards())
+    flags = ["--fit.steps", "6", "--fit.weights.track", "1", "--fit.weights.rigidity", "1"]
+    config = parse_config(Recipe, flags, {}, command="fit").fit
+    apart, as_one = (
+        fit(each, view, priors, config, empty=view.rgb[0], distance=1.0, seed=0).scene.decomposed().tensors()
+        for each in (scene, scene.composed())
+    )
+    changed = apart["moving.means"] - scene.tensors()["moving.means"]
+    assert changed.abs().mean() > 1e-3
+    for name, values in apart.items():  # Adam's first steps have a size that gradients near zero give their sign alone
+        assert (as_one[name] - values).float().abs().mean() < 1e-4, name
+
+
 def test_motion_is_learned_where_its_tensors_are_given() -> None:
     view, priors = still_video()
     scene = grey_scene(view)

@@ -52,6 +52,57 @@ def carried_points(
     return moved
 
 
+def add_level(
+    affines: Float[Tensor, "k b 3 4"],
+    weights: Float[Tensor, "n j"],
+    indices: Int[Tensor, "n j"],
+    maps: Float[Tensor, "b n 12"],
+    turns: Float[Tensor, "b n 4"],
+) -> None:
+    """Have mixed maps follow what has been composed of finer levels, in place.
+
+    Args:
+        affines: of every basis at the times of the batch.
+        weights: of the bases that each point follows; a row adds up to 1.
+        indices: these bases.
+        maps: the points' maps so far, row by row.
+        turns: the rotations that they turn by so far, wxyz.
+    """
+    arrays = [each.contiguous().numpy() for each in (affines.reshape(*affines.shape[:2], 12), weights, indices)]
+    run(_add_level, point_tickets(*maps.shape[:2]), *arrays, maps.numpy(), turns.numpy())
+
+
+def applied(
+    maps: Float[Tensor, "b n 12"],
+    turns: Float[Tensor, "b n 4"],
+    positions: Float[Tensor, "b n 3"],
+    orientations: Float[Tensor, "b n 4"],
+) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b n 4"]]:
+    """Positions (m) and orientations (wxyz) moved by maps that are known; differentiable in these two."""
+    moved, turned = _Apply.apply(maps, turns, positions, orientations)
+    return moved, turned
+
+
+class _Apply(torch.autograd.Function):
+    """Arguments and results as `applied` has them."""
+
+    @staticmethod
+    def forward(ctx: Any, *given: Tensor) -> tuple[Tensor, Tensor]:
+        inputs = [each.detach().contiguous() for each in given]
+        moved, turned = torch.empty_like(inputs[2]), torch.empty_like(inputs[3])
+        arrays = [each.numpy() for each in (*inputs, moved, turned)]
+        run(_apply, point_tickets(*moved.shape[:2]), *arrays)
+        ctx.save_for_backward(*inputs[:2])
+        return moved, turned
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        to_points = [torch.empty(each.shape) for each in gradients]
+        arrays = [each.contiguous().numpy() for each in (*ctx.saved_tensors, *gradients, *to_points)]
+        run(_apply_back, point_tickets(*gradients[0].shape[:2]), *arrays)
+        return None, None, *to_points
+
+
 class _Carry(torch.autograd.Function):
     """Arguments and results as `carried` has them; no points in `quats` where they are not wanted."""
 
@@ -278,4 +329,93 @@ def _backward(
                     total += to_map[entry] * affines[basis, time, entry]
                     to_affines[ticket, basis, entry] += weight * to_map[entry]
                 to_weights[time, point, slot] = total
+        ticket = take_ticket(tickets)
+
+
+@compiled
+def _add_level(
+    tickets: ndarray, affines: ndarray, weights: ndarray, indices: ndarray, maps: ndarray, turns: ndarray
+) -> None:
+    """Of the blocks that this thread draws."""
+    batch, count = maps.shape[:2]
+    blocks = -(-count // POINTS_PER_TICKET)
+    map_, before = np.empty(12, np.float32), np.empty(12, np.float32)
+    ticket = take_ticket(tickets)
+    while ticket < batch * blocks:
+        time, block = ticket // blocks, ticket % blocks
+        for point in range(block * POINTS_PER_TICKET, min(count, (block + 1) * POINTS_PER_TICKET)):
+            _blended(map_, affines, weights, indices, time, point)
+            for entry in range(12):
+                before[entry] = maps[time, point, entry]
+            for row in range(0, 12, 4):
+                for column in range(4):
+                    total = map_[row] * before[column] + map_[row + 1] * before[4 + column]
+                    total += map_[row + 2] * before[8 + column]
+                    maps[time, point, row + column] = total + (map_[row + 3] if column == 3 else np.float32(0))
+            a0, a1, a2, b0, b1, b2, _ = _columns(map_, indices, weights, affines, time, point)
+            x0, x1, x2, y0, y1, y2, _, _, _ = _frame(a0, a1, a2, b0, b1, b2)
+            pw, px, py, pz = _quaternion(x0, x1, x2, y0, y1, y2)
+            qw, qx, qy, qz = turns[time, point]
+            rw, rx, ry, rz = _product(pw, px, py, pz, qw, qx, qy, qz)
+            turns[time, point, 0], turns[time, point, 1] = rw, rx
+            turns[time, point, 2], turns[time, point, 3] = ry, rz
+        ticket = take_ticket(tickets)
+
+
+@compiled
+def _apply(
+    tickets: ndarray,
+    maps: ndarray,
+    turns: ndarray,
+    positions: ndarray,
+    quats: ndarray,
+    moved: ndarray,
+    turned: ndarray,
+) -> None:
+    """Of the blocks that this thread draws."""
+    batch, count = maps.shape[:2]
+    blocks = -(-count // POINTS_PER_TICKET)
+    ticket = take_ticket(tickets)
+    while ticket < batch * blocks:
+        time, block = ticket // blocks, ticket % blocks
+        for point in range(block * POINTS_PER_TICKET, min(count, (block + 1) * POINTS_PER_TICKET)):
+            map_ = maps[time, point]
+            x, y, z = positions[time, point]
+            for axis in range(3):
+                row = 4 * axis
+                moved[time, point, axis] = map_[row] * x + map_[row + 1] * y + map_[row + 2] * z + map_[row + 3]
+            pw, px, py, pz = turns[time, point]
+            qw, qx, qy, qz = quats[time, point]
+            rw, rx, ry, rz = _product(pw, px, py, pz, qw, qx, qy, qz)
+            turned[time, point, 0], turned[time, point, 1] = rw, rx
+            turned[time, point, 2], turned[time, point, 3] = ry, rz
+        ticket = take_ticket(tickets)
+
+
+@compiled
+def _apply_back(
+    tickets: ndarray,
+    maps: ndarray,
+    turns: ndarray,
+    moved: ndarray,
+    turned: ndarray,
+    to_positions: ndarray,
+    to_quats: ndarray,
+) -> None:
+    """Gradients, given those of the results (`moved`, `turned`)."""
+    batch, count = maps.shape[:2]
+    blocks = -(-count // POINTS_PER_TICKET)
+    ticket = take_ticket(tickets)
+    while ticket < batch * blocks:
+        time, block = ticket // blocks, ticket % blocks
+        for point in range(block * POINTS_PER_TICKET, min(count, (block + 1) * POINTS_PER_TICKET)):
+            map_ = maps[time, point]
+            g0, g1, g2 = moved[time, point]
+            for axis in range(3):
+                to_positions[time, point, axis] = map_[axis] * g0 + map_[4 + axis] * g1 + map_[8 + axis] * g2
+            pw, px, py, pz = turns[time, point]
+            gw, gx, gy, gz = turned[time, point]
+            tw, tx, ty, tz = _product(pw, -px, -py, -pz, gw, gx, gy, gz)
+            to_quats[time, point, 0], to_quats[time, point, 1] = tw, tx
+            to_quats[time, point, 2], to_quats[time, point, 3] = ty, tz
         ticket = take_ticket(tickets)

@@ -8,28 +8,54 @@ from lerobot_msdyn.render.cpu.simd import take_ticket
 
 _DIGIT_BITS = 11
 _DIGITS = 1 << _DIGIT_BITS
-_PASSES = 3  # 33 bits, for 32-bit keys
+_PASSES = 3  # 33 bits, for depths of 32
+_HALF = np.uint64(32)
+_INDEX = np.uint64(0xFFFFFFFF)  # the half of a key that is one
+_LAST = np.uint64(0xFFFFFFFFFFFFFFFF)
 
 
 @device
-def _sorted_by_depth(counts, depths):
-    """Indices of the visible Gaussians from near to far, equal depths by index: a radix sort.
+def _key(bits, index):
+    """Orders by depth, then by index: the bits of positive floats order like the floats themselves."""
+    return (np.uint64(bits) << _HALF) | np.uint64(index)
 
-    The bits of positive floats order like the floats themselves. Each key carries its index in its low half.
-    """
+
+@device
+def _in_order(counts, depths, ahead):
+    """Indices of the visible Gaussians from near to far, equal depths by index; the first `ahead` are so already."""
+    bits = depths.view(np.uint32)
+    first = np.empty(ahead + 1, np.uint64)
+    shown = 0
+    for index in range(ahead):
+        first[shown] = _key(bits[index], index)
+        if counts[index] > 0:
+            shown += 1
+    first[shown] = _LAST
+    second = _sorted_keys(counts, bits, ahead)
+    order = np.empty(shown + second.shape[0] - 1, np.int32)
+    i, j = 0, 0
+    for position in range(order.shape[0]):  # no branch, which would be guessed wrong half the time
+        one, other = first[i], second[j]
+        order[position] = np.int32(min(one, other) & _INDEX)
+        nearer = 1 if one < other else 0
+        i, j = i + nearer, j + 1 - nearer
+    return order
+
+
+@device
+def _sorted_keys(counts, bits, ahead):
+    """Keys of the visible Gaussians from `ahead` on, by a radix sort, and one that is behind all."""
     visible = 0
     histogram = np.zeros((_PASSES, _DIGITS), np.int32)
-    keys = np.empty(counts.shape[0], np.uint64)
-    bits = depths.view(np.uint32)
-    for index in range(counts.shape[0]):
+    keys = np.empty(counts.shape[0] - ahead + 1, np.uint64)
+    for index in range(ahead, counts.shape[0]):
         if counts[index] > 0:
-            depth = np.uint64(bits[index])
-            keys[visible] = (depth << np.uint64(32)) | np.uint64(index)
+            keys[visible] = _key(bits[index], index)
             visible += 1
             for digit in range(_PASSES):
-                place = (depth >> np.uint64(_DIGIT_BITS * digit)) & np.uint64(_DIGITS - 1)
+                place = (np.uint64(bits[index]) >> np.uint64(_DIGIT_BITS * digit)) & np.uint64(_DIGITS - 1)
                 histogram[digit, place] += 1
-    other = np.empty(visible, np.uint64)
+    other = np.empty(visible + 1, np.uint64)
     for digit in range(_PASSES):
         starts = histogram[digit]
         total, most = 0, 0
@@ -40,33 +66,32 @@ def _sorted_by_depth(counts, depths):
             most = max(most, here)
         if most == visible:  # the digit is the same everywhere
             continue
-        shift = np.uint64(32 + _DIGIT_BITS * digit)
+        shift = _HALF + np.uint64(_DIGIT_BITS * digit)
         for position in range(visible):
             key = keys[position]
             place = (key >> shift) & np.uint64(_DIGITS - 1)
             other[starts[place]] = key
             starts[place] += 1
         keys, other = other, keys
-    order = np.empty(visible, np.int32)
-    for position in range(visible):
-        order[position] = np.int32(keys[position] & np.uint64(0xFFFFFFFF))
-    return order
+    keys[visible] = _LAST
+    return keys[: visible + 1]
 
 
 @kernel
-def list_per_tile(tickets, counts, depths, rects, offsets, across, starts, listed, slots):
+def list_per_tile(tickets, ahead, counts, depths, rects, offsets, across, starts, listed, slots):
     """Write the depth-sorted list of every tile, view by view.
 
     Args:
         tickets: shared counter of the threads; one ticket is one view.
+        ahead: Gaussians of a backdrop, which come first, from near to far.
         counts: tiles that each Gaussian meets, `[b, g]`.
         depths: z-depth, `[b, g]`.
         rects: the tiles that each Gaussian meets, `[b, g, 4]`.
-        offsets: first gradient slot of each Gaussian, `[b, g + 1]` (the last is the next view's first).
+        offsets: first gradient slot of each Gaussian, `[b, g]`; that of a view's first is where its lists begin.
         across: tiles in a row of the image.
         starts: out, where each tile's list starts, `[b, tiles + 1]`.
         listed: out, indices of Gaussians, all lists one after the other.
-        slots: out, the gradient slot of each list entry.
+        slots: out, the gradient slot of each list entry; of no size without gradients.
     """
     views = counts.shape[0]
     tiles = starts.shape[1] - 1
@@ -74,7 +99,7 @@ def list_per_tile(tickets, counts, depths, rects, offsets, across, starts, liste
         view = take_ticket(tickets)
         if view >= views:
             break
-        order = _sorted_by_depth(counts[view], depths[view])
+        order = _in_order(counts[view], depths[view], ahead)
         start, rect = starts[view], rects[view]
         start[:] = 0
         for index in order:
@@ -92,5 +117,6 @@ def list_per_tile(tickets, counts, depths, rects, offsets, across, starts, liste
                     place = ends[y * across + x]
                     ends[y * across + x] = place + 1
                     listed[place] = index
-                    slots[place] = slot
+                    if slots.shape[0] > 0:
+                        slots[place] = slot
                     slot += 1

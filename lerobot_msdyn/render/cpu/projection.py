@@ -126,14 +126,15 @@ def _tile_range(low, high, side, tiles):
 @kernel
 def project_forward(
     tickets, means, quats, scales, opacities, features, camera_from_world, intrinsics, width, height, near, layout,
-    records, rects, counts, depths, refused,
+    ahead, records, rects, counts, depths, refused,
 ):  # fmt: skip
     """Project every Gaussian into every view.
 
-    Writes per (view, Gaussian): its record (flat), the tiles that it meets (rects `[b, g, 4]`: first x, last x,
-    first y, last y), their number (0: not rendered) and its z-depth. Sets refused[0] if a number cannot be rendered.
+    Writes per (view, Gaussian): its record (flat), the tiles that it meets (rects `[b, ahead + g, 4]`: first x, last x,
+    first y, last y), their number (0: not rendered) and its z-depth, all behind those of the `ahead` Gaussians of a
+    backdrop. Sets refused[0] if a number cannot be rendered.
     """
-    views, count = counts.shape
+    views, count = counts.shape[0], means.shape[1]
     channels = features.shape[2]
     stride = record_stride(layout)
     blocks = (count + CHUNK - 1) // CHUNK
@@ -147,7 +148,8 @@ def project_forward(
         features_view = min(view, features.shape[0] - 1)
         first = ticket % blocks * CHUNK
         for index in range(first, min(first + CHUNK, count)):
-            counts[view, index] = 0
+            place = ahead + index
+            counts[view, place] = 0
             mean = _triple(means, min(view, means.shape[0] - 1), index)
             scale = _triple(scales, min(view, scales.shape[0] - 1), index)
             quat, inverse = _unit_quat(quats, min(view, quats.shape[0] - 1), index)
@@ -159,22 +161,103 @@ def project_forward(
                 refused[0] = 1
                 continue
             point = add(apply(rotation, mean), translation)
-            depths[view, index] = point[2]
+            depths[view, place] = point[2]
             if opacity < _MIN_ALPHA or not _before_camera(point, scale, lens, near):
                 continue
             axes = scale_columns(rotation_of(quat), scale)
-            base = (view * count + index) * stride
+            base = (view * counts.shape[1] + place) * stride
             rect = _write_head(records, base, point, axes, opacity, rotation, lens, width, height)
-            if rect[0] > rect[1] or rect[2] > rect[3]:
+            counts[view, place] = _write_rect(rects, view, place, rect)
+            if counts[view, place] > 0:
+                for channel in range(channels):
+                    records[base + HEAD + channel] = features[features_view, index, channel]
+                _end_record(records, base, stride, channels, point[2])
+
+
+@kernel
+def paint_backdrop(
+    tickets, sources, heads, nearness, features, gains, hidden, shifts, width, height, layout,
+    records, rects, counts, depths, refused,
+):  # fmt: skip
+    """What `project_forward` writes, of the Gaussians of a backdrop, which have been projected before.
+
+    Args:
+        tickets: shared counter of the threads; one ticket is a chunk of Gaussians in one view.
+        sources: those that are rendered, `[v]`.
+        heads: of their records, `[v, HEAD]`.
+        nearness: their z-depth, m, `[v]`.
+        features: of all of the backdrop, `[s, c]`.
+        gains: by which they are multiplied, `[1 or b, s]`.
+        hidden: those that are left out, `[1 or b, s]`.
+        shifts: of each view against the backdrop's own picture, px, `[b, 2]`.
+        width: of the views, px.
+        height: of the views, px.
+        layout: the kernel's planes.
+        records: out, flat.
+        rects: out, `[b, v + g, 4]`.
+        counts: out, `[b, v + g]`.
+        depths: out, `[b, v + g]`.
+        refused: out, set if a feature cannot be rendered.
+    """
+    views, count = counts.shape[0], heads.shape[0]
+    channels = features.shape[1]
+    stride = record_stride(layout)
+    blocks = (count + CHUNK - 1) // CHUNK
+    while True:
+        ticket = take_ticket(tickets)
+        if ticket >= views * blocks:
+            break
+        view = ticket // blocks
+        gains_view, hidden_view = min(view, gains.shape[0] - 1), min(view, hidden.shape[0] - 1)
+        first = ticket % blocks * CHUNK
+        for place in range(first, min(first + CHUNK, count)):
+            counts[view, place] = 0
+            source = sources[place]
+            if hidden[hidden_view, source]:
                 continue
-            for side in range(4):
-                rects[view, index, side] = rect[side]
-            counts[view, index] = (rect[1] - rect[0] + 1) * (rect[3] - rect[2] + 1)
+            center_x, center_y = heads[place, CENTER_X] + shifts[view, 0], heads[place, CENTER_Y] + shifts[view, 1]
+            rect = _tiles_met(center_x, center_y, heads[place, HALF_WIDTH], heads[place, HALF_HEIGHT], width, height)
+            counts[view, place] = _write_rect(rects, view, place, rect)
+            if counts[view, place] == 0:
+                continue
+            depths[view, place] = nearness[place]
+            base = (view * counts.shape[1] + place) * stride
+            for entry in range(HEAD):
+                records[base + entry] = heads[place, entry]
+            records[base + CENTER_X], records[base + CENTER_Y] = center_x, center_y
             for channel in range(channels):
-                records[base + HEAD + channel] = features[features_view, index, channel]
-            records[base + HEAD + channels] = point[2]
-            for rest in range(HEAD + channels + 1, stride):
-                records[base + rest] = _ZERO
+                value = features[source, channel] * gains[gains_view, source]
+                records[base + HEAD + channel] = value
+                if not _finite(value):
+                    refused[0] = 1
+            _end_record(records, base, stride, channels, nearness[place])
+
+
+@device
+def _write_rect(rects, view, place, rect):
+    """Note the tiles that a Gaussian meets; returns their number."""
+    if rect[0] > rect[1] or rect[2] > rect[3]:
+        return 0
+    for side in range(4):
+        rects[view, place, side] = rect[side]
+    return (rect[1] - rect[0] + 1) * (rect[3] - rect[2] + 1)
+
+
+@device
+def _end_record(records, base, stride, channels, depth):
+    """Fill a record behind its features."""
+    records[base + HEAD + channels] = depth
+    for rest in range(HEAD + channels + 1, stride):
+        records[base + rest] = _ZERO
+
+
+@device
+def _tiles_met(center_x, center_y, half_x, half_y, width, height):
+    """The tiles that an extent meets: first x, last x, first y, last y."""
+    across, down = tiles_of(width, height)
+    x0, x1 = _tile_range(center_x - half_x, center_x + half_x, TILE_WIDTH, across)
+    y0, y1 = _tile_range(center_y - half_y, center_y + half_y, TILE_HEIGHT, down)
+    return x0, x1, y0, y1
 
 
 @device
@@ -199,9 +282,6 @@ def _write_head(records, base, point, axes, opacity, rotation, lens, width, heig
     log2_opacity = math.log2(opacity)
     reach = _TWO * _MINUS_LN2 * (_LOG2_MIN_ALPHA - log2_opacity)  # square of the extent in standard deviations
     half_x, half_y = math.sqrt(reach * var_x) + _SLACK, math.sqrt(reach * var_y) + _SLACK
-    across, down = tiles_of(width, height)
-    x0, x1 = _tile_range(center_x - half_x, center_x + half_x, TILE_WIDTH, across)
-    y0, y1 = _tile_range(center_y - half_y, center_y + half_y, TILE_HEIGHT, down)
     inverse = _ONE / determinant
     records[base + CENTER_X] = center_x
     records[base + CENTER_Y] = center_y
@@ -211,7 +291,7 @@ def _write_head(records, base, point, axes, opacity, rotation, lens, width, heig
     records[base + LOG2_OPACITY] = log2_opacity
     records[base + HALF_WIDTH] = half_x
     records[base + HALF_HEIGHT] = half_y
-    return x0, x1, y0, y1
+    return _tiles_met(center_x, center_y, half_x, half_y, width, height)
 
 
 @kernel
