@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lerobot_msdyn.core.cli import EXIT_OK, EXIT_SOME_EPISODES_FAILED, parse_config, run_command
 from lerobot_msdyn.core.config import RobotConfig
@@ -17,6 +18,9 @@ from lerobot_msdyn.core.errors import ConfigError, OutputError, PriorError
 from lerobot_msdyn.core.fields import between
 from lerobot_msdyn.core.files import write_whole
 from lerobot_msdyn.dataset.named import check_there
+
+if TYPE_CHECKING:
+    from lerobot_msdyn.dataset.select import Listing
 
 logger = logging.getLogger(__name__)
 
@@ -56,17 +60,20 @@ def run(arguments: list[str]) -> int:
     if not config.repo_id:
         raise ConfigError(f"--repo is missing; expected: {COMMAND} --repo NAME [--root FOLDER] [--robot.name so101]")
     check_there(config.repo_id, config.root)
+    from lerobot_msdyn.dataset.metadata import described  # needs neither LeRobot nor torch, which take long
+    from lerobot_msdyn.robots import check_description
+
+    meta = described(config.repo_id, config.root)
+    if meta is not None:
+        _chosen(config, meta)
+        check_description(config.robot, meta.robot_type)
     from lerobot_msdyn.augment.riding_cameras import riding_camera
     from lerobot_msdyn.augment.robot_cameras import NAME, robot_cameras, summary
     from lerobot_msdyn.dataset.read import open_source
-    from lerobot_msdyn.dataset.select import select_cameras, select_episodes
 
     source = open_source(config.repo_id, config.root)
-    episodes = select_episodes(source, config.episodes)
-    keys = select_cameras(source, config.cameras, allow_moving=bool(config.link))
+    episodes, keys = _chosen(config, source)
     if config.link:
-        if len(keys) != 1:
-            raise ConfigError(f"--link is for one camera, which --cameras names; got {', '.join(keys)}")
         riding = riding_camera(source, keys[0], config.link, episodes, config.robot, config.max_episodes)
         sys.stdout.write(f"{riding}\n")
         out = config.out or Path("poses")
@@ -89,6 +96,17 @@ def run(arguments: list[str]) -> int:
     sys.stdout.write(f"{out}\n")
     complete = not any(place.doubt for _, _, place in found.named())
     return EXIT_OK if complete else EXIT_SOME_EPISODES_FAILED
+
+
+def _chosen(config: CalibrateConfig, meta: "Listing") -> tuple[list[int], list[str]]:
+    """The episodes, and the feature keys of the cameras."""
+    from lerobot_msdyn.dataset.select import select_cameras, select_episodes
+
+    episodes = select_episodes(meta, config.episodes)
+    keys = select_cameras(meta, config.cameras, allow_moving=bool(config.link))
+    if config.link and len(keys) != 1:
+        raise ConfigError(f"--link is for one camera, which --cameras names; got {', '.join(keys)}")
+    return episodes, keys
 
 
 def _poses_written(out: Path, files: Iterator[Path]) -> int:

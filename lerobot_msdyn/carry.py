@@ -94,8 +94,13 @@ def run(arguments: list[str]) -> int:
     config = parse_config(CarryConfig, arguments, {}, command=COMMAND)
     if config.root is None or not config.sources:
         raise ConfigError(f"which datasets? {COMMAND} --root FOLDER --sources '[FOLDER, ...]' (see --help)")
-    for root in (config.root, *config.sources):
+    roots = (config.root, *config.sources)
+    for root in roots:
         check_root(root)
+    from lerobot_msdyn.dataset.metadata import described  # needs neither LeRobot nor torch, which take long
+
+    for root in roots:
+        described(root.name, root)
     count = carry_provenance(config.root, config.sources)
     sys.stdout.write(f"meta/msdyn/ of {count} episodes written to {config.root}\n")
     return EXIT_OK

@@ -10,6 +10,8 @@ from pathlib import Path
 from lerobot_msdyn.core.cli import EXIT_OK, parse_config, run_command
 from lerobot_msdyn.core.errors import ConfigError, OutputError
 from lerobot_msdyn.core.fields import MAX_INDEX, between
+from lerobot_msdyn.dataset.named import output_folder
+from lerobot_msdyn.scene.folders import list_scenes
 
 COMMAND = "python -m lerobot_msdyn.export_ply"
 
@@ -35,11 +37,7 @@ def run(arguments: list[str]) -> int:
     config = parse_config(ExportPlyConfig, arguments, {}, command=COMMAND)
     if config.scenes is None:
         raise ConfigError(f"which scenes? {COMMAND} --scenes FOLDER [--episode 0] [--frames 0-9] (see --help)")
-    from lerobot_msdyn.dataset.named import output_folder
-    from lerobot_msdyn.scene import store
-    from lerobot_msdyn.scene.ply import export_frames
-
-    scenes = store.list_scenes(output_folder(config.scenes))
+    scenes = list_scenes(output_folder(config.scenes))
     if config.episode not in scenes:
         there = ", ".join(map(str, scenes))
         raise ConfigError(f"{config.scenes}: no scene of episode {config.episode}; there are those of {there}")
@@ -47,7 +45,10 @@ def run(arguments: list[str]) -> int:
     names = [key for key in cameras if config.camera in ("", key, key.rsplit(".", 1)[-1])]
     if not names:
         raise ConfigError(f"{config.scenes}: no scene of camera {config.camera!r}; there are {', '.join(cameras)}")
-    scene = store.load(cameras[names[0]])
+    from lerobot_msdyn.scene.ply import export_frames  # torch takes long: only now
+    from lerobot_msdyn.scene.store import load
+
+    scene = load(cameras[names[0]])
     beyond = [frame for frame in config.frames if not 0 <= frame < len(scene)]
     if beyond:
         raise ConfigError(f"frames: no frame {beyond[0]}; episode {config.episode} has 0 to {len(scene) - 1}")

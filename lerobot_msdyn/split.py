@@ -129,6 +129,9 @@ def run(arguments: list[str]) -> int:
         raise ConfigError(f"which dataset? {COMMAND} --repo NAME or --root FOLDER (see --help)")
     root = config.root or lerobot_home() / config.repo_id
     check_root(root)
+    from lerobot_msdyn.dataset.metadata import described  # needs neither LeRobot nor torch, which take long
+
+    described(root.name, root)
     split = split_by_source(root, config.eval_split)
     logger.info("%d episodes to train on, %d to evaluate on", len(split.train), len(split.evaluation))
     sys.stdout.write(" ".join(split.arguments) + "\n")

@@ -19,13 +19,16 @@ from lerobot_msdyn.core.cli import EXIT_OK, parse_config, run_command
 from lerobot_msdyn.core.config import Recipe
 from lerobot_msdyn.core.errors import ConfigError, DatasetError, MsdynError, OutputError
 from lerobot_msdyn.core.fields import MAX_INDEX, between
+from lerobot_msdyn.core.perturbation import check_pose
 from lerobot_msdyn.dataset.named import check_there, output_folder
+from lerobot_msdyn.scene.folders import list_scenes
 
 if TYPE_CHECKING:
     import rerun as rr
 
     from lerobot_msdyn.core.cameras import CameraTrack
     from lerobot_msdyn.core.observations import View
+    from lerobot_msdyn.dataset.select import Listing
     from lerobot_msdyn.priors import Priors
     from lerobot_msdyn.scene.store import SavedScene
 
@@ -67,6 +70,14 @@ def run(arguments: list[str]) -> int:
     if not config.repo_id:
         raise ConfigError(f"which dataset? {COMMAND} --repo NAME [--root FOLDER] (see --help)")
     check_there(config.repo_id, config.root)
+    from lerobot_msdyn.dataset.metadata import described  # needs neither LeRobot nor torch, which take long
+    from lerobot_msdyn.priors.files import check_files
+
+    check_pose(config.perturbation)
+    meta = described(config.repo_id, config.root)
+    if meta is not None:
+        _chosen(config, meta)
+    check_files(config.camera, config.priors)
     try:
         import rerun as rr
     except ImportError as error:
@@ -90,6 +101,21 @@ def run(arguments: list[str]) -> int:
         show_episode(config, stream)
         stream.flush()
     return EXIT_OK
+
+
+def _chosen(config: ViewerConfig, meta: "Listing") -> tuple[int, list[str], dict[str, Path] | None]:
+    """The episode, its cameras, and their kept scenes where --scenes names some."""
+    from lerobot_msdyn.dataset.select import select_cameras, select_episodes
+
+    (index,) = select_episodes(meta, [config.episode])
+    cameras = select_cameras(meta, config.cameras)
+    if config.scenes is None:
+        return index, cameras, None
+    saved = list_scenes(output_folder(config.scenes)).get(index, {})
+    cameras = [key for key in cameras if key in saved]
+    if not cameras:
+        raise DatasetError(f"{config.scenes}: no saved scene of episode {index} of {meta.repo_id}")
+    return index, cameras, saved
 
 
 def _has_display() -> bool:
@@ -142,20 +168,12 @@ def show_episode(config: ViewerConfig, stream: "rr.RecordingStream") -> None:
         DatasetError: there is no such dataset or episode, or the scenes hold none of it.
     """
     from lerobot_msdyn.dataset.read import open_source, read_episode
-    from lerobot_msdyn.dataset.select import select_cameras, select_episodes
     from lerobot_msdyn.priors import estimate_priors
     from lerobot_msdyn.scene import store
-    from lerobot_msdyn.views.camera_change import check_pose
 
     check_pose(config.perturbation)
     source = open_source(config.repo_id, config.root)
-    (index,) = select_episodes(source, [config.episode])
-    cameras = select_cameras(source, config.cameras)
-    saved = None if config.scenes is None else store.list_scenes(output_folder(config.scenes)).get(index, {})
-    if saved is not None:
-        cameras = [key for key in cameras if key in saved]
-        if not cameras:
-            raise DatasetError(f"{config.scenes}: no saved scene of episode {index} of {source.repo_id}")
+    index, cameras, saved = _chosen(config, source)
     episode = read_episode(source, index, cameras, config.camera, recorded_depth=config.priors.reads_recorded_depth)
     small = {key: view.shrunk(config.fit.max_width) for key, view in episode.views.items()}
     for key, view in episode.views.items():

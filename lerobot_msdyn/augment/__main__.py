@@ -30,6 +30,9 @@ def run(arguments: list[str]) -> int:
     if not config.repo_id:
         raise ConfigError(f"which dataset? {COMMAND} --repo NAME [--root FOLDER] (see --help)")
     check_there(config.repo_id, config.root)
+    from lerobot_msdyn.augment.asked import check_asked  # needs neither LeRobot nor torch, which take long
+
+    check_asked(config)
     logger.info("opening %s", config.root or config.repo_id)
     # LeRobot and torch take seconds to import: only now, so that --help and bad flags are answered at once.
     from lerobot_msdyn.augment.job import finished_before, open_job, place_of

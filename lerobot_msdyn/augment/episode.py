@@ -11,12 +11,13 @@ import numpy as np
 from lerobot.datasets import LeRobotDatasetMetadata
 from torch import Tensor
 
+from lerobot_msdyn.augment.asked import no_other_camera
 from lerobot_msdyn.augment.backgrounds import Backgrounds
 from lerobot_msdyn.augment.earlier_scenes import earlier_scene
 from lerobot_msdyn.augment.recorded import read_recorded
 from lerobot_msdyn.augment.shown import steps_with_sheet, write_frame
 from lerobot_msdyn.core.config import GateConfig, Recipe
-from lerobot_msdyn.core.errors import ConfigError, EpisodeError
+from lerobot_msdyn.core.errors import EpisodeError
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.dataset.calibration import read_calibration
 from lerobot_msdyn.dataset.pose_columns import ORIGIN, new_poses
@@ -258,10 +259,7 @@ def _other_pose(recipe: Recipe, index: int, view: View) -> Tensor | None:
         height, width = view.rgb.shape[1:3]
         camera = read_calibration(recipe.camera.calibration, name, index, 1, width, height)
     if camera is None:
-        raise ConfigError(
-            f"perturbation.camera is {name!r}, which the calibration {recipe.camera.calibration} does not "
-            "name; expected a camera with K, R and t there (--camera.calibration FILE)"
-        )
+        raise no_other_camera(recipe)
     return camera.world_from_camera[0]
 
 

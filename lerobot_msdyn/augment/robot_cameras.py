@@ -17,6 +17,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import OBS_STATE
 from numpy import ndarray
 
+from lerobot_msdyn.augment.asked import asks_the_joints
 from lerobot_msdyn.augment.backgrounds import looked_at
 from lerobot_msdyn.core.config import Recipe, RobotConfig
 from lerobot_msdyn.core.errors import ConfigError, DatasetError, EpisodeError, PriorError
@@ -191,8 +192,7 @@ def publish(folder: Path, place: Path) -> None:
 
 def calibration_episodes(source: LeRobotDatasetMetadata, config: Recipe) -> list[int]:
     """The episodes that tell where cameras stand, beside those that are worked on; none where that is known."""
-    wanted = config.camera.by_robot and config.camera.calibration is None and config.scenes is None
-    return looked_at(source.total_episodes) if wanted else []
+    return looked_at(source.total_episodes) if asks_the_joints(config) else []
 
 
 def robot_cameras(

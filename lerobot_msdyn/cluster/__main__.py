@@ -31,6 +31,9 @@ def run(arguments: list[str]) -> int:
     if importlib.util.find_spec("datatrove") is None:
         raise ConfigError("cluster needs datatrove; install it with: pip install 'lerobot_msdyn[cluster]'")
     check_there(config.repo_id, config.root)
+    from lerobot_msdyn.augment.asked import check_asked
+
+    check_asked(config)
     from lerobot_msdyn.augment.job import finished_before
     from lerobot_msdyn.augment.run_identity import source_folder
     from lerobot_msdyn.cluster.plan import job_of

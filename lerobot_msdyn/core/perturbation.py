@@ -156,6 +156,19 @@ class Perturbation(draccus.ChoiceRegistry):
         return _new, (_Plugins(), type(self)), vars(self)
 
 
+def check_pose(perturbation: Perturbation, other: object = None) -> None:
+    """Whether the pose is there that a perturbation needs.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    if perturbation.needs_pose_of is not None and other is None:
+        raise ConfigError(
+            f"perturbation {perturbation.type_name!r} needs the pose of camera {perturbation.needs_pose_of!r}, which "
+            "is not kept with saved scenes; choose another type"
+        )
+
+
 class _Plugins:
     """Stands for what was imported by `--plugins`; unpickled, it has been imported."""
 

@@ -1,10 +1,7 @@
 """The recorded camera: from a calibration file (docs/calibration.md), else fixed with a default field of view."""
 
-import json
-import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import UInt8
@@ -14,6 +11,7 @@ from lerobot_msdyn.core.cameras import CameraTrack, intrinsics_from_fov, static_
 from lerobot_msdyn.core.config import CameraConfig
 from lerobot_msdyn.core.errors import PriorError
 from lerobot_msdyn.core.geometry import invert_se3, se3
+from lerobot_msdyn.dataset.calibration_file import camera_entry, read_calibration_file
 from lerobot_msdyn.robots.calibration.record import RobotRecord, read_record
 
 
@@ -38,16 +36,7 @@ def read_calibration(path: Path, camera: str, episode: int, frames: int, width: 
     Raises:
         PriorError: the file cannot be read or an entry has the wrong shape.
     """
-    content = _content(path)
-    try:
-        section = content.get("episodes", {}).get(str(episode), content)
-        cameras: dict[str, Any] = dict(section.get("cameras", {}))
-    except (ValueError, AttributeError, TypeError) as error:
-        raise PriorError(
-            f"{path}: calibration cannot be read ({error}); expected a JSON file with the cameras by name, see "
-            "docs/calibration.md"
-        ) from error
-    entry = next((cameras[name] for name in _names(camera) if name in cameras), None)
+    entry = camera_entry(path, camera, episode)
     if entry is None:
         return None
     try:
@@ -70,22 +59,5 @@ def read_robot(path: Path) -> RobotRecord | None:
     Raises:
         PriorError: the file cannot be read, or its entry `robot` cannot be used.
     """
-    entry = _content(path).get("robot")
+    entry = read_calibration_file(path).get("robot")
     return None if entry is None else read_record(entry, path)
-
-
-def _content(path: Path) -> dict[str, Any]:
-    try:
-        return dict(json.loads(path.read_text()))
-    except (OSError, ValueError, TypeError) as error:
-        raise PriorError(
-            f"{path}: calibration cannot be read ({error}); expected a JSON file with the cameras by name, see "
-            "docs/calibration.md"
-        ) from error
-
-
-def _names(camera: str) -> list[str]:
-    """What a calibration file may call a camera."""
-    last = camera.rsplit(".", 1)[-1]
-    number = re.search(r"\d+$", last)
-    return [camera, last, *([number[0]] if number else [])]

@@ -22,6 +22,7 @@ import pyarrow.parquet as pq
 
 from lerobot_msdyn.core.errors import DatasetError
 
+CODEBASE_VERSION = "v3.0"
 MAX_JSON_BYTES = 64 << 20
 MAX_SIDE_PX = 16_384
 MAX_FPS = 1000
@@ -63,6 +64,23 @@ class IntactEpisodes:
             f"them again. For LeRobot to open the dataset, set total_episodes to {self.count} and total_frames to "
             f"{self.frames} in meta/info.json, and delete {delete}any file without a footer in data/"
         )
+
+
+def check_version(root: Path) -> None:
+    """Whether a dataset is of the version that this LeRobot reads.
+
+    Raises:
+        DatasetError: it is not; the way to convert it is named.
+    """
+    version = read_json(root, "meta/info.json").get("codebase_version")
+    if version == "v2.1":
+        todo = "add --convert to work on a converted copy of it (the source stays as it is)"
+    elif str(version).startswith(("v1", "v2")):
+        todo = "convert it to v2.1 with an older LeRobot first, then add --convert"
+    else:
+        todo = "use a LeRobot and an lerobot_msdyn that know this version"
+    if version != CODEBASE_VERSION:
+        raise DatasetError(f"{root} is a LeRobot dataset of version {version}; expected {CODEBASE_VERSION}; {todo}")
 
 
 def check_metadata(root: Path) -> IntactEpisodes:

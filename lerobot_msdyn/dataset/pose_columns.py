@@ -18,7 +18,7 @@ from lerobot_msdyn.core.errors import ConfigError, EpisodeError
 from lerobot_msdyn.core.fields import AUTO
 from lerobot_msdyn.core.geometry import invert_se3
 from lerobot_msdyn.dataset.rows import read_columns
-from lerobot_msdyn.dataset.select import colour_cameras
+from lerobot_msdyn.dataset.select import check_cameras_named
 
 ORIGIN = "column"
 WORLD = "the dataset's poses"  # of all such columns: an episode whose poses are not in it is found out by its pictures
@@ -112,13 +112,8 @@ def check_pose_columns(meta: LeRobotDatasetMetadata, config: CameraConfig) -> No
     Raises:
         ConfigError: it has not.
     """
-    keys = colour_cameras(meta)
-    known = {*keys, *(key.rsplit(".", 1)[-1] for key in keys)}
-    for camera, name in config.pose_columns.items():
-        if camera not in known:
-            raise ConfigError(
-                f"camera.pose_columns names the camera {camera!r}; {meta.repo_id} has {', '.join(keys) or 'none'}"
-            )
+    check_cameras_named(meta, config.pose_columns)
+    for name in config.pose_columns.values():
         _column(meta, name, config)
 
 

@@ -27,7 +27,7 @@ from lerobot_msdyn.core.errors import DatasetError, EpisodeError, first_line
 from lerobot_msdyn.core.files import cache_folder, check_root
 from lerobot_msdyn.core.observations import RobotSeen, View
 from lerobot_msdyn.dataset.calibration import make_camera, read_robot
-from lerobot_msdyn.dataset.checks import IntactEpisodes, check_metadata, picture_size, read_json
+from lerobot_msdyn.dataset.checks import IntactEpisodes, check_metadata, check_version, picture_size
 from lerobot_msdyn.dataset.chroma import is_subsampled, with_chroma
 from lerobot_msdyn.dataset.features import completed
 from lerobot_msdyn.dataset.named import check_named, no_dataset
@@ -46,7 +46,6 @@ from lerobot_msdyn.robots.seen import robot_seen
 
 logger = logging.getLogger(__name__)
 
-CODEBASE_VERSION = "v3.0"
 MILLIMETRES = 1000.0
 
 
@@ -138,23 +137,6 @@ def _from_hub(repo_id: str) -> Path:
         return LeRobotDatasetMetadata(repo_id).root
     except Exception as error:
         raise no_dataset(repo_id, error) from error
-
-
-def check_version(root: Path) -> None:
-    """Whether a dataset is of the version that this LeRobot reads.
-
-    Raises:
-        DatasetError: it is not; the way to convert it is named.
-    """
-    version = read_json(root, "meta/info.json").get("codebase_version")
-    if version == "v2.1":
-        todo = "add --convert to work on a converted copy of it (the source stays as it is)"
-    elif str(version).startswith(("v1", "v2")):
-        todo = "convert it to v2.1 with an older LeRobot first, then add --convert"
-    else:
-        todo = "use a LeRobot and an lerobot_msdyn that know this version"
-    if version != CODEBASE_VERSION:
-        raise DatasetError(f"{root} is a LeRobot dataset of version {version}; expected {CODEBASE_VERSION}; {todo}")
 
 
 def read_episode(

@@ -1,10 +1,11 @@
 """Which episodes and cameras of a dataset are worked on: those asked for, or all that may be re-rendered."""
 
 import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Protocol, runtime_checkable
 
-from lerobot.datasets import LeRobotDatasetMetadata
-
-from lerobot_msdyn.core.errors import DatasetError
+from lerobot_msdyn.core.errors import ConfigError, DatasetError
 from lerobot_msdyn.dataset.checks import read_json
 
 # Words in names of cameras: wrist, left_wrist, handcam, eye_in_hand, gripper2; but not handover or toolbox.
@@ -13,7 +14,23 @@ ON_ROBOT = re.compile(
 )
 
 
-def select_episodes(meta: LeRobotDatasetMetadata, episodes: list[int] | None) -> list[int]:
+@runtime_checkable
+class Listing(Protocol):
+    """What is chosen from: LeRobot's metadata of a dataset, or `metadata.Metadata`, which needs no LeRobot."""
+
+    @property
+    def repo_id(self) -> str: ...
+    @property
+    def root(self) -> Path: ...
+    @property
+    def total_episodes(self) -> int: ...
+    @property
+    def camera_keys(self) -> list[str]: ...
+    @property
+    def depth_keys(self) -> list[str]: ...
+
+
+def select_episodes(meta: Listing, episodes: list[int] | None) -> list[int]:
     """The episodes asked for, each once and in order; all of them if none are named.
 
     Raises:
@@ -36,17 +53,17 @@ def select_episodes(meta: LeRobotDatasetMetadata, episodes: list[int] | None) ->
     return sorted(set(episodes))
 
 
-def lost_episodes(meta: LeRobotDatasetMetadata) -> range:
+def lost_episodes(meta: Listing) -> range:
     """Episodes that info.json lists and a killed recorder has not finished (`open_source` has warned of them)."""
     return range(meta.total_episodes, read_json(meta.root, "meta/info.json")["total_episodes"])
 
 
-def colour_cameras(meta: LeRobotDatasetMetadata) -> list[str]:
+def colour_cameras(meta: Listing) -> list[str]:
     """Feature keys of the colour cameras."""
     return [key for key in meta.camera_keys if key not in meta.depth_keys]
 
 
-def select_cameras(meta: LeRobotDatasetMetadata, cameras: list[str] | None, *, allow_moving: bool = False) -> list[str]:
+def select_cameras(meta: Listing, cameras: list[str] | None, *, allow_moving: bool = False) -> list[str]:
     """The cameras to re-render: those asked for (by key or its last part), else all that are not on the robot.
 
     Raises:
@@ -73,6 +90,21 @@ def select_cameras(meta: LeRobotDatasetMetadata, cameras: list[str] | None, *, a
             "state, and would belong to another one; leave it out"
         )
     return chosen
+
+
+def check_cameras_named(meta: Listing, names: Iterable[str]) -> None:
+    """Whether the dataset has the cameras that `camera.pose_columns` names, by key or its last part.
+
+    Raises:
+        ConfigError: it has not.
+    """
+    keys = colour_cameras(meta)
+    known = {*keys, *(key.rsplit(".", 1)[-1] for key in keys)}
+    for name in names:
+        if name not in known:
+            raise ConfigError(
+                f"camera.pose_columns names the camera {name!r}; {meta.repo_id} has {', '.join(keys) or 'none'}"
+            )
 
 
 def is_wrist_camera(key: str) -> bool:

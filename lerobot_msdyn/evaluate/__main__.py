@@ -19,12 +19,18 @@ COMMAND = "python -m lerobot_msdyn.evaluate"
 
 
 def _nvs(config: EvaluateConfig) -> str:
+    from lerobot_msdyn.evaluate.asked import check_nvs
+
+    check_nvs(config)
     from lerobot_msdyn.evaluate.nvs import evaluate_nvs
 
     return evaluate_nvs(config).text()
 
 
 def _dycheck(config: DycheckConfig) -> str:
+    from lerobot_msdyn.evaluate.asked import check_dycheck
+
+    check_dycheck(config)
     from lerobot_msdyn.evaluate.dycheck.protocol import evaluate_dycheck
 
     return evaluate_dycheck(config).text()
@@ -32,6 +38,9 @@ def _dycheck(config: DycheckConfig) -> str:
 
 def _heldout_camera(config: HeldoutCameraConfig) -> str:
     check_there(config.repo_id, config.root)
+    from lerobot_msdyn.evaluate.asked import check_heldout
+
+    check_heldout(config)
     from lerobot_msdyn.evaluate.heldout import evaluate_heldout
 
     return evaluate_heldout(config).text()

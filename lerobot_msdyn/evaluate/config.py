@@ -33,6 +33,11 @@ class EvaluateConfig(ScoredConfig):
     # Whether one factor of all depths is fitted to the true views as well, which tells wrong shape from wrong scale.
     fit_scale: bool = False
 
+    @property
+    def depth_provider(self) -> str:
+        """What `depth` is in the priors' terms."""
+        return {"recorded": "recorded", "none": "plane"}.get(self.depth, self.depth)
+
 
 @dataclass
 class DycheckConfig(ScoredConfig):

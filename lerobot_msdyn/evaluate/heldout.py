@@ -7,14 +7,13 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, UInt8
-from lerobot.datasets import LeRobotDatasetMetadata
 from numpy import ndarray
 
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.dataset.read import Episode, open_source, read_episode
-from lerobot_msdyn.dataset.select import colour_cameras, select_cameras
+from lerobot_msdyn.evaluate.asked import chosen_cameras
 from lerobot_msdyn.evaluate.colour import fit_colours
 from lerobot_msdyn.evaluate.config import HeldoutCameraConfig
 from lerobot_msdyn.evaluate.perceptual import SpatialNetwork, lpips_network, without_flip, without_lpips
@@ -54,7 +53,7 @@ def evaluate_heldout(config: HeldoutCameraConfig) -> Evaluated:
     seconds: dict[str, float] = {}
     with timed(seconds, "read"):
         source = open_source(config.repo_id, config.root)
-        train, test, helpers = _cameras(source, config)
+        train, test, helpers = chosen_cameras(source, config)
         episode = read_episode(source, config.episode, [train, test, *helpers], config.camera)
         _check_calibrated(episode, train, test, config)
     view, held_out = episode.views[train], episode.views[test]
@@ -84,18 +83,6 @@ def evaluate_heldout(config: HeldoutCameraConfig) -> Evaluated:
     content |= {"seconds": seconds, "notices": [notice for notice in notices if notice]}
     table = score_table(rows, f"{train} -> {test}, {100 * covered.mean():.0f} % covered")
     return Evaluated(content, table, config.out).written()
-
-
-def _cameras(source: LeRobotDatasetMetadata, config: HeldoutCameraConfig) -> tuple[str, str, list[str]]:
-    """Keys of the fitted camera, of the held-out one, and of those that help to measure depth."""
-    train, test = (
-        select_cameras(source, [name], allow_moving=config.allow_moving)[0]
-        for name in (config.train_camera, config.test_camera)
-    )
-    if train == test:
-        raise ConfigError(f"--train-camera and --test-camera are both {train}; expected two cameras")
-    wanted = select_cameras(source, config.cameras) if config.cameras is not None else colour_cameras(source)
-    return train, test, [key for key in wanted if key not in (train, test)]
 
 
 def _check_calibrated(episode: Episode, train: str, test: str, config: HeldoutCameraConfig) -> None:

@@ -23,6 +23,7 @@ from lerobot_msdyn.core.errors import DatasetError
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.dataset.read import open_source, read_episode
 from lerobot_msdyn.dataset.select import select_cameras
+from lerobot_msdyn.evaluate.asked import read_arrays, recorded_camera, recorded_dataset
 from lerobot_msdyn.evaluate.config import EvaluateConfig
 from lerobot_msdyn.evaluate.perceptual import SpatialNetwork, lpips_network, without_flip, without_lpips
 from lerobot_msdyn.evaluate.scale import HeldOut, at_scale, fitted_scale
@@ -54,7 +55,7 @@ def evaluate_nvs(config: EvaluateConfig) -> Evaluated:
     seconds: dict[str, float] = {}
     with timed(seconds, "read"):
         view = read_view(config)
-    config.priors.depth = {"recorded": "recorded", "none": "plane"}.get(config.depth, config.depth)
+    config.priors.depth = config.depth_provider
     scene = timed_reconstruction(seconds, view, config)
     lpips = None if without_lpips(config.lpips_weights) else lpips_network(config.lpips_weights)
     cameras: dict[str, Scores] = {}
@@ -121,13 +122,12 @@ def read_view(config: EvaluateConfig) -> View:
 
     What a robot's joints tell of the camera, as in the job, is told of its links alone.
     """
-    folder, recorded = config.scene_folder, config.depth == "recorded"
-    train = _arrays(folder / "gt" / "train.npz", ("K", "c2w"))
-    source = open_source(f"local/{folder.name}", folder / ("dataset_depth" if recorded else "dataset"))
+    train = recorded_camera(config)
+    source = open_source(*recorded_dataset(config))
     key = select_cameras(source, config.cameras)[0]
     (config.out / ROBOT / NAME).unlink(missing_ok=True)  # it may be another scene's
     found = calibrated(source, [0], [key], config, config.out / ROBOT)
-    view = read_episode(source, 0, [key], found.camera, recorded_depth=recorded).views[key]
+    view = read_episode(source, 0, [key], found.camera, recorded_depth=config.depth == "recorded").views[key]
     height, width = view.rgb.shape[1:3]
     camera = _track(train, width, height)
     robot = None if view.robot is None or not camera.is_static else through(view.robot, view.camera, camera)
@@ -141,7 +141,7 @@ def read_truth(folder: Path, camera: str) -> TrueViews | None:
         DatasetError: a file cannot be read, or its parts do not belong together.
     """
     path = folder / "gt" / "heldout" / f"{camera}.npz"
-    arrays = _arrays(path, ("frame",), ("covis", "seg"))
+    arrays = read_arrays(path, ("frame",), ("covis", "seg"))
     rgb = _true_pictures(path, arrays["frame"].tolist()) if "covis" in arrays else None
     if rgb is None:
         return None
@@ -161,7 +161,7 @@ def read_truth(folder: Path, camera: str) -> TrueViews | None:
 
 def _held_out_camera(scene: Reconstruction, path: Path) -> tuple[CameraTrack, Int[Tensor, " n"]]:
     """A held-out camera, at the size of the recorded one, and the frames that its poses belong to."""
-    arrays = _arrays(path, ("frame", "c2w", "K"))
+    arrays = read_arrays(path, ("frame", "c2w", "K"))
     return _track(arrays, scene.camera.width, scene.camera.height), torch.as_tensor(arrays["frame"]).long()
 
 
@@ -205,14 +205,3 @@ def _moving_bodies(meta: Path) -> list[int]:
         return [int(body) for body in json.loads(meta.read_text())["dynamic_ids"]]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DatasetError(f"{meta}: expected dynamic_ids, a list of body ids ({error})") from error
-
-
-def _arrays(path: Path, names: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Some arrays of an npz file; the others are not read."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in names + tuple(name for name in optional if name in file)}
-    except (OSError, ValueError, KeyError) as error:
-        raise DatasetError(
-            f"{path}: expected an npz file with {', '.join(names)} ({error}); see docs/evaluate.md"
-        ) from error

@@ -16,13 +16,13 @@ from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from lerobot_msdyn.core.errors import ConfigError, first_line
+from lerobot_msdyn.core.errors import ConfigError
+from lerobot_msdyn.evaluate.asked import ALEXNET_FILE, unreadable_weights
 from lerobot_msdyn.priors.hub import checkpoint, has_library
 from lerobot_msdyn.priors.models import MODELS, how_to_fetch
 
 INSTALL = "pip install 'lerobot_msdyn[evaluate]'"
 ALEXNET = MODELS["alexnet"]
-_EXPECTED = "the state of lpips.LPIPS(net='alex').net, or torchvision's checkpoint of AlexNet"
 _SAVED = (
     'make a file for --lpips_weights where it is installed: python -c "import lpips, torch; '
     "torch.save(lpips.LPIPS(net='alex').net.state_dict(), 'alex.pt')\""
@@ -92,15 +92,13 @@ def _features(path: Path) -> dict[str, Tensor]:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except (OSError, RuntimeError, EOFError, ValueError, pickle.UnpicklingError) as error:
-        raise ConfigError(
-            f"lpips_weights: {path} cannot be read ({first_line(error)}); expected {_EXPECTED}"
-        ) from error
+        raise unreadable_weights(path, error) from error
     named = content.items() if isinstance(content, dict) else []
     parts = {name: value for name, value in named if isinstance(value, Tensor) and _FEATURE.match(str(name))}
     state = {".".join(name.split(".")[1:]): value for name, value in parts.items()}
     shapes = {name: tuple(value.shape) for name, value in state.items() if name.endswith("weight")}
     if shapes != _SHAPES or len(state) != 2 * len(_SHAPES):
-        raise ConfigError(f"lpips_weights: {path} holds no AlexNet; expected {_EXPECTED}")
+        raise ConfigError(f"lpips_weights: {path} holds no AlexNet; expected {ALEXNET_FILE}")
     return state
 
 

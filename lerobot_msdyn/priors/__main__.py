@@ -18,6 +18,7 @@ from lerobot_msdyn.dataset.named import check_there
 
 if TYPE_CHECKING:
     from lerobot_msdyn.dataset.read import Episode
+    from lerobot_msdyn.dataset.select import Listing
 
 logger = logging.getLogger(__name__)
 
@@ -50,12 +51,17 @@ def run(arguments: list[str]) -> int:
         if not given:
             raise ConfigError(f"--{name} is missing; expected: {COMMAND} --repo NAME [--root FOLDER] --out DIR")
     check_there(config.repo_id, config.root)
+    from lerobot_msdyn.dataset.metadata import described  # needs neither LeRobot nor torch, which take long
+    from lerobot_msdyn.priors.files import check_files
+
+    meta = described(config.repo_id, config.root)
+    if meta is not None:
+        _chosen(config, meta)
+    check_files(config.camera, config.priors)
     from lerobot_msdyn.dataset.read import open_source, read_episode
-    from lerobot_msdyn.dataset.select import select_cameras, select_episodes
 
     source = open_source(config.repo_id, config.root)
-    cameras = select_cameras(source, config.cameras)
-    episodes = select_episodes(source, config.episodes)
+    cameras, episodes = _chosen(config, source)
     failures = []
     for index in episodes:
         try:
@@ -67,6 +73,13 @@ def run(arguments: list[str]) -> int:
     if len(failures) == len(episodes):
         raise failures[0]
     return EXIT_SOME_EPISODES_FAILED if failures else EXIT_OK
+
+
+def _chosen(config: PriorsCommandConfig, meta: "Listing") -> tuple[list[str], list[int]]:
+    """The feature keys of the cameras, and the episodes."""
+    from lerobot_msdyn.dataset.select import select_cameras, select_episodes
+
+    return select_cameras(meta, config.cameras), select_episodes(meta, config.episodes)
 
 
 def one_episode(episode: "Episode", config: PriorsCommandConfig) -> None:

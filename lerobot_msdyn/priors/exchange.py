@@ -15,9 +15,10 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, Shaped, UInt8
 from numpy import ndarray
 
-from lerobot_msdyn.core.errors import PriorError, first_line
+from lerobot_msdyn.core.errors import PriorError
 from lerobot_msdyn.core.observations import Model, Priors, View
 from lerobot_msdyn.priors.cache import save_npz
+from lerobot_msdyn.priors.files import unreadable
 
 DEPTH_KINDS = METRIC, SCALE, AFFINE_DISPARITY = "metric", "scale", "affine_disparity"
 MAX_INSTANCE = 255
@@ -77,18 +78,6 @@ def from_priors(view: View, priors: Priors, episode: int, camera: str) -> Exchan
         world=pinhole.world,
         provenance=priors.provenance,
     )
-
-
-def exchange_path(pattern: str, episode: int | None, camera: str | None) -> Path:
-    """The file that a setting names; `{episode}` and `{camera}` in it stand for those of the video.
-
-    Raises:
-        PriorError: there is something else in braces.
-    """
-    try:
-        return Path(pattern.format(episode=0 if episode is None else episode, camera=camera or "camera")).expanduser()
-    except (KeyError, ValueError, IndexError, AttributeError) as error:
-        raise PriorError(f"{pattern!r} names no file: in braces only {{episode}} and {{camera}} are known") from error
 
 
 def write_exchange(path: Path, content: Exchange) -> None:
@@ -160,9 +149,7 @@ def _load(path: Path) -> dict[str, ndarray]:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
     except (OSError, ValueError, KeyError, EOFError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
-        raise PriorError(
-            f"{path}: not a readable npz file of plain arrays ({first_line(error)}); see docs/priors.md"
-        ) from error
+        raise unreadable(path, error) from error
 
 
 def _check_origin(path: Path, arrays: dict[str, ndarray], frames: int, episode: int | None, camera: str | None) -> None:

@@ -9,7 +9,8 @@ from torch import Tensor
 from lerobot_msdyn.core.config import CameraConfig, PriorsConfig
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.priors.cache import PriorCache
-from lerobot_msdyn.priors.exchange import Exchange, exchange_path, read_exchange
+from lerobot_msdyn.priors.exchange import Exchange, read_exchange
+from lerobot_msdyn.priors.files import exchange_path
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from lerobot_msdyn.core.config import RobotConfig
 from lerobot_msdyn.core.errors import ConfigError
-from lerobot_msdyn.robots.load import INSTALL
+from lerobot_msdyn.robots.load import INSTALL, read_urdf
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,15 @@ def find_description(urdf: Path | None = None, name: str = "", robot_type: str |
         f"the description of {wanted!r} is not on this machine; get it by {', or '.join(ways)}, or give a file by "
         f"--robot.urdf ({INSTALL} has the readers)"
     )
+
+
+def check_description(config: RobotConfig, robot_type: str | None) -> None:
+    """Whether the description is on this machine of the robot that settings name, or else a dataset's `robot_type`.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    read_urdf(find_description(config.urdf, config.name, robot_type).urdf)
 
 
 def name_of(robot_type: str | None) -> str:

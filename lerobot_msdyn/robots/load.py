@@ -37,10 +37,7 @@ def load_robot(urdf: Path, licence: str = "", cache: Path | None = None) -> Robo
     Raises:
         ConfigError: it cannot be read, has no meshes, or some of them are absent.
     """
-    try:
-        text = urdf.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"{urdf}: the robot's description cannot be read ({first_line(error)})") from error
+    text = read_urdf(urdf)
     kept = None if cache is None else cache / f"{urdf.stem}-{_digest(urdf, text)}.safetensors"
     robot = None if kept is None else _read(kept)
     if robot is None:
@@ -48,6 +45,18 @@ def load_robot(urdf: Path, licence: str = "", cache: Path | None = None) -> Robo
         if kept is not None:
             _keep(kept, robot)
     return replace(robot, licence=licence, source=str(urdf))
+
+
+def read_urdf(urdf: Path) -> bytes:
+    """The content of a robot's description.
+
+    Raises:
+        ConfigError: it cannot be read.
+    """
+    try:
+        return urdf.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"{urdf}: the robot's description cannot be read ({first_line(error)})") from error
 
 
 def mesh_file(urdf: Path, name: str) -> Path:

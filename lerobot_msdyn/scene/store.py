@@ -21,17 +21,20 @@ from lerobot_msdyn.core.serialise import from_named_tensors, named_tensors, read
 from lerobot_msdyn.motion.model.bases import MotionLevel
 from lerobot_msdyn.motion.spec import level_spec
 from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.folders import FOLDER as FOLDER
+from lerobot_msdyn.scene.folders import HEADER
+from lerobot_msdyn.scene.folders import list_scenes as list_scenes
+from lerobot_msdyn.scene.folders import scenes_root as scenes_root
 from lerobot_msdyn.scene.gaussians import Gaussians
 from lerobot_msdyn.scene.overlay import Overlay
 from lerobot_msdyn.scene.shading import Shading
 from lerobot_msdyn.scene.short_lived import ShortLived
 
-FOLDER = Path("msdyn_scenes")  # inside an output dataset
 FOLDER_SCHEMA = 1  # of the folder of one camera
 SCENE_SCHEMA = 4  # of one scene's file
 _WITHOUT_SHORT_LIVED = 3  # of one that has none of them: what earlier versions read
 _SCENE_HEADER = "lerobot_msdyn"
-_HEADER, _CAMERA, _WINDOW = "scene.json", "camera.safetensors", "window_{:03d}.safetensors"
+_CAMERA, _WINDOW = "camera.safetensors", "window_{:03d}.safetensors"
 
 
 @dataclass(frozen=True)
@@ -107,7 +110,7 @@ def save(scene: SavedScene, root: Path, beside: Mapping[str, object] | None = No
         write_tensors(partial / _CAMERA, named_tensors(scene.camera))
         for name, value in (beside or {}).items():
             save_value(partial / name, value, partial)
-        (partial / _HEADER).write_text(json.dumps(header, indent=1), encoding="utf-8")
+        (partial / HEADER).write_text(json.dumps(header, indent=1), encoding="utf-8")
         shutil.rmtree(folder, ignore_errors=True)
         partial.rename(folder)
     return folder
@@ -153,7 +156,7 @@ def read_header(folder: Path) -> dict[str, Any]:
     Raises:
         MsdynError: it is absent, damaged or of another schema.
     """
-    path = folder / _HEADER
+    path = folder / HEADER
     try:
         header = json.loads(path.read_text(encoding="utf-8"))
         schema = header["schema"]
@@ -164,34 +167,6 @@ def read_header(folder: Path) -> dict[str, Any]:
     if schema != FOLDER_SCHEMA:
         raise MsdynError(f"{path}: schema is {schema}; expected {FOLDER_SCHEMA}; make it again with --save_scenes true")
     return dict(header)
-
-
-def scenes_root(folder: Path) -> Path:
-    """The folder of scenes of an output dataset, or the folder itself where it is one.
-
-    Raises:
-        MsdynError: there are none.
-    """
-    for root in (folder / FOLDER, folder):
-        if next(root.glob(f"episode_*/*/{_HEADER}"), None) is not None:
-            return root
-    raise MsdynError(
-        f"no saved scenes in {folder}: expected {FOLDER}/episode_000000/<camera>/{_HEADER}; "
-        "they are kept by `python -m lerobot_msdyn.augment ... --save_scenes true`"
-    )
-
-
-def list_scenes(folder: Path) -> dict[int, dict[str, Path]]:
-    """Source episode -> camera -> the folder of its scene; `folder` is an output dataset or its folder of scenes.
-
-    Raises:
-        MsdynError: there are none.
-    """
-    folders: dict[int, dict[str, Path]] = {}
-    for header in sorted(scenes_root(folder).glob(f"episode_*/*/{_HEADER}")):
-        episode = int(header.parent.parent.name.removeprefix("episode_"))
-        folders.setdefault(episode, {})[header.parent.name] = header.parent
-    return folders
 
 
 def save_scene(scene: DynamicScene, path: Path) -> None:

@@ -13,14 +13,14 @@ from torch import Tensor
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.core.fields import problems
-from lerobot_msdyn.core.perturbation import Perturbation
+from lerobot_msdyn.core.perturbation import Perturbation, check_pose
 from lerobot_msdyn.dataset.named import output_folder
 from lerobot_msdyn.dataset.read import MILLIMETRES, depth_key_of
 from lerobot_msdyn.training.config import MixedViewsConfig
 from lerobot_msdyn.training.live import LiveScene
 from lerobot_msdyn.training.matching import scenes_of, settings_of
 from lerobot_msdyn.training.scene_cache import SceneCache, Scenes
-from lerobot_msdyn.views.camera_change import check_pose, sample_change
+from lerobot_msdyn.views.camera_change import sample_change
 from lerobot_msdyn.views.coverage import HOLE_ALPHA
 
 FACTORS = (1.0, 0.5, 0.25)  # of a change, until little enough of the picture is empty

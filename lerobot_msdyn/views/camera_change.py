@@ -14,7 +14,7 @@ from torch.quasirandom import SobolEngine
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.core.geometry import invert_se3
-from lerobot_msdyn.core.perturbation import AMOUNTS, Perturbation, Viewpoint
+from lerobot_msdyn.core.perturbation import AMOUNTS, Perturbation, Viewpoint, check_pose
 from lerobot_msdyn.reconstruction.result import Reconstruction
 from lerobot_msdyn.scene.store import SavedScene
 from lerobot_msdyn.views.offsets import offsets
@@ -101,19 +101,6 @@ def sample_change(
     amounts = {key: perturbation.amounts(shares, view, variant) for key, view in views.items()}
     rows = {key: _checked(perturbation, values, frames) for key, values in amounts.items()}
     return CameraChange(views, rows, perturbation.moves_rig)
-
-
-def check_pose(perturbation: Perturbation, other: Float[Tensor, "4 4"] | None = None) -> None:
-    """Whether the pose is there that a perturbation needs.
-
-    Raises:
-        ConfigError: it is not.
-    """
-    if perturbation.needs_pose_of is not None and other is None:
-        raise ConfigError(
-            f"perturbation {perturbation.type_name!r} needs the pose of camera {perturbation.needs_pose_of!r}, which "
-            "is not kept with saved scenes; choose another type"
-        )
 
 
 def _points(key: Sequence[int], count: int) -> Float32[ndarray, "count m"]:

@@ -10,6 +10,7 @@ import torch
 
 from lerobot_msdyn.core.errors import ConfigError
 from lerobot_msdyn.evaluate import perceptual
+from lerobot_msdyn.evaluate.asked import check_weights
 from lerobot_msdyn.evaluate.perceptual import lpips_network, masked_flip, masked_lpips, without_flip, without_lpips
 
 
@@ -122,8 +123,20 @@ def test_a_file_of_something_else_is_named_in_a_line(alexnet, tmp_path: Path) ->
         ) as caught:
             lpips_network(path)
         assert "\n" not in str(caught.value)
-    with pytest.raises(ConfigError, match=r"absent\.pt cannot be read"):
-        lpips_network(tmp_path / "absent.pt")
+
+
+def test_an_absent_file_is_named_before_the_fit_in_the_same_words(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "absent.pt"
+    with pytest.raises(ConfigError, match=r"absent\.pt cannot be read") as late:
+        lpips_network(path)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: name)
+    with pytest.raises(ConfigError) as early:
+        check_weights(path)
+    assert str(early.value) == str(late.value)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    check_weights(path)  # nobody will read it
 
 
 @pytest.mark.slow

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from lerobot_msdyn.core.errors import PriorError
-from lerobot_msdyn.priors.exchange import Exchange, exchange_path, read_exchange, write_exchange
+from lerobot_msdyn.priors.exchange import Exchange, read_exchange, write_exchange
+from lerobot_msdyn.priors.files import exchange_path
 
 T, H, W, N = 5, 24, 32, 7
 FRONT = "observation.images.front"

@@ -15,13 +15,12 @@ named `<camera>_<time>`: camera 0 is held in the hand and fitted, the others sta
 The center and scale of scene.json, which bring a scene into a box of diagonal 1, are not applied: all stays in metres.
 """
 
-import json
 import shutil
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -34,6 +33,7 @@ from lerobot_msdyn.core.errors import DatasetError
 from lerobot_msdyn.core.images import nearest_of
 from lerobot_msdyn.core.observations import View
 from lerobot_msdyn.evaluate.config import Protocol
+from lerobot_msdyn.evaluate.dycheck.splits import read_json, read_split
 from lerobot_msdyn.priors.hub import demand_library
 
 FACTOR: dict[Protocol, int] = {"som": 1, "dycheck": 2}  # by which pictures are smaller than the recorded ones
@@ -89,8 +89,8 @@ def read_sequence(root: Path, protocol: Protocol) -> IphoneSequence:
         DatasetError: a file is absent or not as described above.
         PriorError: pycolmap, which reads Shape of Motion's cameras, is not installed.
     """
-    names, times = _split(root, "train")
-    validation, validation_times = _split(root, "val")
+    names, times = read_split(root, "train")
+    validation, validation_times = read_split(root, "val")
     if not validation:
         raise DatasetError(f"{root}: splits/val.json names no picture: nothing to score (five sequences have some)")
     factor = FACTOR[protocol]
@@ -151,49 +151,13 @@ def _recorded(picture: UInt8[ndarray, "h w c"]) -> UInt8[ndarray, "h w 3"]:
     return rgb if seen.all() else rgb.reshape(-1, 3)[nearest_of(seen)]
 
 
-def _split(root: Path, name: str) -> tuple[list[str], list[int]]:
-    """Pictures and their times; those of camera 0 in the order of time."""
-    own = not (root / "splits").is_dir() and (root / "dataset.json").is_file()
-    content = _own_split(root, name) if own else _json(root / "splits" / f"{name}.json")
-    try:
-        names, times = [str(each) for each in content["frame_names"]], [int(each) for each in content["time_ids"]]
-    except (KeyError, TypeError, ValueError) as error:
-        raise DatasetError(f"{root}/splits/{name}.json: expected frame_names and time_ids ({error})") from error
-    if len(names) != len(times) or (name == "train" and not names):
-        raise DatasetError(f"{root}/splits/{name}.json: has {len(names)} frame_names and {len(times)} time_ids")
-    order = np.argsort(times, kind="stable").tolist() if name == "train" else range(len(names))
-    return [names[i] for i in order], [times[i] for i in order]
-
-
-def _own_split(root: Path, name: str) -> dict[str, list[Any]]:
-    """What DyCheck's loader puts in splits/ where that is absent: camera 0 is fitted, the others validate."""
-    pictures, described = _json(root / "dataset.json"), _json(root / "metadata.json")
-    try:
-        ids = [each for each in pictures["ids"] if (described[each]["camera_id"] == 0) == (name == "train")]
-        return {"frame_names": ids, "time_ids": [described[each]["warp_id"] for each in ids]}
-    except (KeyError, TypeError) as error:
-        raise DatasetError(
-            f"{root}: has no splits/, and dataset.json and metadata.json do not tell ids, camera_id and warp_id of its "
-            f"pictures ({error})"
-        ) from error
-
-
-def _json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise DatasetError(
-            f"{path}: cannot be read ({error}); expected a DyCheck sequence, see docs/evaluate.md"
-        ) from error
-
-
 def _json_cameras(root: Path, names: Sequence[str]) -> _Cameras:
     """Those of the sequence's own files."""
     intrinsics, poses = np.zeros((len(names), 3, 3)), np.tile(np.eye(4), (len(names), 1, 1))
     sizes = np.zeros((len(names), 2))
     for i, name in enumerate(names):
         path = root / "camera" / f"{name}.json"
-        content = _json(path)
+        content = read_json(path)
         try:
             focal, (x, y) = content["focal_length"], content["principal_point"]
             ratio, skew = content.get("pixel_aspect_ratio", 1.0), content.get("skew", 0.0)
