@@ -45,7 +45,16 @@ def test_the_scene_that_was_given_is_not_changed() -> None:
 
 def test_levels_as_one_are_fitted_alike() -> None:
     scene, (view, priors) = in_single(moving_cards()), recorded_in_single(moving_cards())
-    flags = ["--fit.steps", "6", "--fit.weights.track", "1", "--fit.weights.rigidity", "1"]
+    flags = [
+        "--fit.steps",
+        "6",
+        "--fit.moving_gain_from",
+        "1",
+        "--fit.weights.track",
+        "1",
+        "--fit.weights.rigidity",
+        "1",
+    ]
     config = parse_config(Recipe, flags, {}, command="fit").fit
     apart, as_one = (
         fit(each, view, priors, config, empty=view.rgb[0], distance=1.0, seed=0).scene.decomposed().tensors()
