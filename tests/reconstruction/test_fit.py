@@ -63,7 +63,7 @@ def test_levels_as_one_are_fitted_alike() -> None:
     changed = apart["moving.means"] - scene.tensors()["moving.means"]
     assert changed.abs().mean() > 1e-3
     for name, values in apart.items():  # Adam's first steps have a size that gradients near zero give their sign alone
-        assert (as_one[name] - values).float().abs().mean() < 1e-3, name
+        assert (as_one[name].float() - values.float()).abs().mean() < 1e-3, name
 
 
 def test_motion_is_learned_where_its_tensors_are_given() -> None:
