@@ -24,6 +24,7 @@ from lerobot_msdyn.render.cpu.threads import each_on, in_threads
 from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.scene.rendering import render_scene
 from lerobot_msdyn.scene.shading import Shading, encode_gain, no_shading
+from lerobot_msdyn.scene.still_view import StillView
 
 BLUR_PX = 1.5  # of 320: noise, and texture that does not fit, are averaged over about this
 FIELD_STEP = 2  # px of the fitted image per pixel of the field of gains
@@ -183,7 +184,8 @@ def moving_gain(scene: DynamicScene, view: View, priors: Priors, backend: str = 
     Rendered with the gains that the scene has already, so that these only need to be multiplied by what is returned.
     """
     frames = sorted({*range(0, len(view.rgb), MOVING_STEP), len(view.rgb) - 1})
-    of_frame = functools.partial(_seen_sums, scene, view, priors, backend)
+    still = scene.still_before(view.camera, backend)
+    of_frame = functools.partial(_seen_sums, scene, view, priors, backend, still)
     sums = torch.stack([*each_on(scene.device, of_frame, frames)])  # s m 2
     if len(frames) > 2:
         padded = torch.nn.functional.pad(sums.permute(1, 2, 0), (1, 1))
@@ -193,10 +195,12 @@ def moving_gain(scene: DynamicScene, view: View, priors: Priors, backend: str = 
     return encode_gain(_at_every_frame(log, seen, torch.tensor(frames), len(view.rgb)).exp())
 
 
-def _seen_sums(scene: DynamicScene, view: View, priors: Priors, backend: str, frame: int) -> Float[Tensor, "m 2"]:
+def _seen_sums(
+    scene: DynamicScene, view: View, priors: Priors, backend: str, still: StillView | None, frame: int
+) -> Float[Tensor, "m 2"]:
     """Blurred brightness recorded and rendered at the pixel of each moving Gaussian; zero where it is not seen."""
     camera, when = view.camera.select([frame]), torch.tensor([frame])
-    rendered = to_device(render_scene(scene, camera, when, backend), "cpu")
+    rendered = to_device(render_scene(scene, camera, when, backend, still=still), "cpu")
     usable = ((rendered.moving[0] > SURE_WEIGHT) & (priors.instances[frame] > 0)).numpy()
     recorded, rendered_grey = _grey(view.rgb[frame].numpy()), _grey(255 * rendered.rgb[0].numpy())
     sums = torch.from_numpy(_blurred_sums(recorded, rendered_grey, usable))

@@ -12,7 +12,7 @@ from lerobot_msdyn.core.sampling import evenly
 from lerobot_msdyn.core.serialise import to_device
 from lerobot_msdyn.core.visibility import projected
 from lerobot_msdyn.render.cpu.threads import each_on
-from lerobot_msdyn.scene.dynamic import DynamicScene
+from lerobot_msdyn.scene.dynamic import DynamicScene, Snapshot
 from lerobot_msdyn.scene.rendering import render_snapshot
 
 logger = logging.getLogger(__name__)
@@ -38,11 +38,13 @@ def without_contradicted(scene: DynamicScene, view: View) -> DynamicScene:
     count = len(scene.moving)
     if count == 0:
         return scene
-    frames = evenly(len(view), SAMPLES)
+    frames, still = evenly(len(view), SAMPLES), scene.still_before(view.camera)
 
     def compared(frame: Int[Tensor, "1"]) -> tuple[Bool[Tensor, " m"], Bool[Tensor, " m"]]:
         camera = to_device(view.camera.select(frame), scene.device)
-        return _compared(scene, camera, frame, view.rgb[frame[0]].to(scene.device) / 255)
+        backdrop = None if still is None else still.at(frame)
+        snapshot = scene.at(frame, camera.world_from_camera[:, :3, 3], backdrop)
+        return _compared(snapshot, camera, scene.near, count, view.rgb[frame[0]].to(scene.device) / 255)
 
     seen, wrong = (torch.zeros(count, device=scene.device) for _ in range(2))
     for visible, differs in each_on(scene.device, compared, frames.split(1)):
@@ -54,15 +56,14 @@ def without_contradicted(scene: DynamicScene, view: View) -> DynamicScene:
 
 
 def _compared(
-    scene: DynamicScene, camera: CameraTrack, frame: Tensor, recorded: Float[Tensor, "h w 3"]
+    snapshot: Snapshot, camera: CameraTrack, near: float, count: int, recorded: Float[Tensor, "h w 3"]
 ) -> tuple[Bool[Tensor, " m"], Bool[Tensor, " m"]]:
-    """Which of the moving set are to be seen at a frame, and which have another colour than the pixels there."""
-    snapshot = scene.at(frame, camera.world_from_camera[:, :3, 3])
-    means, colours = snapshot.means[0, len(scene.static) :], snapshot.rgb[0, len(scene.static) :]
+    """Which of so many moving ones are to be seen at a frame, and which have another colour than the pixels there."""
+    means, colours = snapshot.means[0, -count:], snapshot.rgb[0, -count:]
     seen = projected(means, camera)
     row, column = seen.pixel
     height, width = recorded.shape[:2]
-    rendering = render_snapshot(snapshot, camera, scene.near)
+    rendering = render_snapshot(snapshot, camera, near)
     away = (rendering.rgb[0].clamp(0, 1) - recorded).abs().mean(-1)
     away = torch.nn.functional.max_pool2d(away[None, None], 3, stride=1, padding=1)[0, 0]
     error = torch.full_like(means[:, 0], float("inf"))

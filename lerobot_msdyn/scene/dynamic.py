@@ -136,6 +136,12 @@ class DynamicScene:
         """The static set before the first pose of a camera (on its device), for `once` or for many pictures."""
         return still_view(self.static, self.shading, camera, self.near, backend, once=once)
 
+    def still_before(self, camera: CameraTrack, backend: str = "auto") -> StillView | None:
+        """The same for all pictures of a camera; None where it moves, or on a GPU, for which projecting is little."""
+        if self.device.type != "cpu" or not camera.is_static:
+            return None
+        return self.still_view(camera, backend)
+
     def without_patches(self) -> "DynamicScene":
         """What its two sets alone show."""
         return replace(self, short_lived=None, overlay=None)

@@ -33,7 +33,7 @@ Rendered = tuple[Rendering, list[Coverage], Float[Tensor, "#t #h #w 3"]]  # fram
 class _Still:
     """What stands still through a fixed camera, the same for all frames: nothing flickers, and it is looked up once."""
 
-    view: StillView | None  # for all pictures; on a GPU, which projects many at a time, None
+    view: StillView | None
     filling: Float[Tensor, "1 h w 3"] | None  # with its holes filled
     looked: Looked
 
@@ -162,7 +162,7 @@ def _still(window: FittedWindow, camera: CameraTrack, times: Tensor, fill: Fill)
     """What a fixed camera sees of what stands still, in the middle of its frames."""
     middle = [len(times) // 2]
     pose = camera.select(middle)
-    view = window.scene.still_view(pose) if window.scene.device.type == "cpu" else None
+    view = window.scene.still_before(pose)
     rendering = next(render_frames(window.scene.still(), pose, times[middle], still=view))
     filling = None if fill == "none" else _filled(rendering, 0, fill)[None]
     return _Still(view, filling, looked(rendering.depth[0], to_device(pose, rendering.depth.device), window.evidence))

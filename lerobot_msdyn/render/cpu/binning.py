@@ -78,7 +78,7 @@ def _sorted_keys(counts, bits, ahead):
 
 
 @kernel
-def list_per_tile(tickets, ahead, counts, depths, rects, offsets, across, starts, listed, slots):
+def list_per_tile(tickets, ahead, counts, depths, rects, ends_of_views, across, starts, listed, offsets, slots):
     """Write the depth-sorted list of every tile, view by view.
 
     Args:
@@ -87,11 +87,12 @@ def list_per_tile(tickets, ahead, counts, depths, rects, offsets, across, starts
         counts: tiles that each Gaussian meets, `[b, g]`.
         depths: z-depth, `[b, g]`.
         rects: the tiles that each Gaussian meets, `[b, g, 4]`.
-        offsets: first gradient slot of each Gaussian, `[b, g]`; that of a view's first is where its lists begin.
+        ends_of_views: where the lists of each view end, `[b]`.
         across: tiles in a row of the image.
         starts: out, where each tile's list starts, `[b, tiles + 1]`.
         listed: out, indices of Gaussians, all lists one after the other.
-        slots: out, the gradient slot of each list entry; of no size without gradients.
+        offsets: out, first gradient slot of each Gaussian, `[b, g]`; of no size without gradients.
+        slots: out, the gradient slot of each list entry, likewise.
     """
     views = counts.shape[0]
     tiles = starts.shape[1] - 1
@@ -106,12 +107,17 @@ def list_per_tile(tickets, ahead, counts, depths, rects, offsets, across, starts
             for y in range(rect[index, 2], rect[index, 3] + 1):
                 for x in range(rect[index, 0], rect[index, 1] + 1):
                     start[y * across + x + 1] += 1
-        start[0] = offsets[view, 0]
+        start[0] = ends_of_views[view - 1] if view > 0 else 0
         for tile in range(tiles):
             start[tile + 1] += start[tile]
         ends = start.copy()
+        if slots.shape[0] > 0:
+            slot = start[0]
+            for index in range(counts.shape[1]):
+                offsets[view, index] = slot
+                slot += counts[view, index]
         for index in order:
-            slot = offsets[view, index]
+            slot = offsets[view, index] if slots.shape[0] > 0 else 0
             for y in range(rect[index, 2], rect[index, 3] + 1):
                 for x in range(rect[index, 0], rect[index, 1] + 1):
                     place = ends[y * across + x]

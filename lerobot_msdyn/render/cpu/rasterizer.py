@@ -127,7 +127,7 @@ class _Projected:
     records: np.ndarray  # float32, flat: [b, g, layout.record]; Gaussians of a backdrop come first
     counts: np.ndarray  # int32 [b, g], tiles that a Gaussian meets
     depths: np.ndarray  # float32 [b, g], m, of those that meet any
-    offsets: np.ndarray  # int64 [b, g], first gradient slot of a Gaussian
+    offsets: np.ndarray  # int64 [b, g], first gradient slot of a Gaussian, if slots are kept
     starts: np.ndarray  # int64 [b, tiles + 1], where each tile's list starts
     listed: np.ndarray  # int32, Gaussians, list after list
     slots: np.ndarray  # int64, gradient slots of the list entries, if they are kept
@@ -177,13 +177,13 @@ def _project(
     )  # fmt: skip
     if refused[0]:
         raise _RefusedError("a Gaussian holds a number that cannot be rendered; backend='reference' may take it")
-    total = np.cumsum(counts.reshape(-1), dtype=np.int64).reshape(views, count)
-    offsets = total - counts
-    entries = int(total[-1, -1]) if total.size else 0
+    ends_of_views = counts.sum(1, dtype=np.int64).cumsum()
+    entries = int(ends_of_views[-1]) if views else 0
+    offsets = np.empty((views, count if kept else 0), np.int64)
     across, down = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
     starts, ends = np.empty((views, across * down + 1), np.int64), np.empty((views, across * down), np.int64)
     listed, slots = np.empty(entries, np.int32), np.empty(entries if kept else 0, np.int64)
-    run(list_per_tile, views, ahead, counts, depths, rects, offsets, across, starts, listed, slots)
+    run(list_per_tile, views, ahead, counts, depths, rects, ends_of_views, across, starts, listed, offsets, slots)
     return _Projected(layout, records, counts, depths, offsets, starts, listed, slots, ends)
 
 
