@@ -45,7 +45,7 @@ from lerobot_msdyn.scene.rendering import render_frames
 from lerobot_msdyn.synthetic import make_scene
 from lerobot_msdyn.synthetic.dataset import write_dataset
 from lerobot_msdyn.views.new_cameras import new_cameras
-from lerobot_msdyn.views.pictures import new_pictures, on_device
+from lerobot_msdyn.views.pictures import for_many_views, new_pictures
 
 KEY = "observation.images.front"
 ALL_KEPT = {  # views are judged, but none is sampled again or dropped
@@ -213,7 +213,7 @@ def episode(target: Device, options: argparse.Namespace, folder: Path) -> Iterat
     if target.is_cuda:
         row["outside kernels"] = 1 - _fit_kernel_ms(target, view, config) / row["ms per step"]
     yield row
-    ready = on_device(scene, target.device)
+    ready = for_many_views(scene, target.device)
     camera = new_cameras({KEY: ready}, config, 0, 0).cameras[KEY]
     row = {"case": "rendering through a new camera"}
     with target.peak_mb(row):

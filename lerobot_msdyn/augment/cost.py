@@ -27,7 +27,7 @@ from lerobot_msdyn.reconstruction.reconstruct import FURTHER_STEPS, STEPS, Draft
 from lerobot_msdyn.reconstruction.result import Reconstruction
 from lerobot_msdyn.render.devices import chosen_device
 from lerobot_msdyn.scene.dynamic import DynamicScene
-from lerobot_msdyn.views.pictures import new_pictures, on_device
+from lerobot_msdyn.views.pictures import for_many_views, new_pictures
 
 logger = logging.getLogger(__name__)
 
@@ -108,7 +108,7 @@ def measure_speeds(source: LeRobotDatasetMetadata, index: int, cameras: list[str
         scene_bytes, frame_bytes = scene_bytes + once, frame_bytes + each
         with tempfile.TemporaryDirectory() as folder, time_spent_compiling() as compiling_s:
             start = time.perf_counter()
-            scene_here = on_device(scene, chosen_device(recipe.device))
+            scene_here = for_many_views(scene, chosen_device(recipe.device))
             pictures = by_feature(source, {key: new_pictures(scene_here, scene.camera.select(times), times)})
             staged = stage_pictures(source, Path(folder), pictures, len(part.rgb))
             render_s += (time.perf_counter() - start - compiling_s()) / len(part.rgb)

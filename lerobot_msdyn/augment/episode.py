@@ -36,7 +36,7 @@ from lerobot_msdyn.scene.store import SceneSource
 from lerobot_msdyn.views.flashes import Flash, Flashes, largest_flash, too_large
 from lerobot_msdyn.views.gate import judge, reasons, record, video_reasons
 from lerobot_msdyn.views.new_cameras import NewCameras, new_cameras
-from lerobot_msdyn.views.pictures import Picture, UnseenMasks, log_uncovered, new_pictures, on_device
+from lerobot_msdyn.views.pictures import Picture, UnseenMasks, for_many_views, log_uncovered, new_pictures
 
 logger = logging.getLogger(__name__)
 
@@ -99,7 +99,7 @@ def augment_episode(
             scenes[key] = kept.keep(f"{SCENE}_{key}", make_scene)
         except EpisodeError as error:
             raise EpisodeError(f"{source.repo_id} episode {index}, {key}: {error}") from error
-    ready = {key: on_device(scene, chosen_device(recipe.device)) for key, scene in scenes.items()}
+    ready = {key: for_many_views(scene, chosen_device(recipe.device)) for key, scene in scenes.items()}
     priors = {key: scene.provenance for key, scene in scenes.items()}
     new = []
     if recipe.include_source:

@@ -11,7 +11,7 @@ from torch.nn.utils.rnn import pad_sequence
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.serialise import named_tensors
 from lerobot_msdyn.motion.model.compose import Level, compose, compose_points
-from lerobot_msdyn.motion.model.composed import ComposedLevel, composed_level
+from lerobot_msdyn.motion.model.composed import MOST_BYTES, ComposedLevel, composed_level
 from lerobot_msdyn.render import Painted
 from lerobot_msdyn.scene.gaussians import Gaussians
 from lerobot_msdyn.scene.overlay import PATCH_OPACITY, FramePatch, Overlay
@@ -112,9 +112,9 @@ class DynamicScene:
         indices, logits = self.followed_by(which)
         return replace(self, moving=self.moving.select(which), indices=indices, logits=logits, shading=shading)
 
-    def composed(self) -> "DynamicScene":
+    def composed(self, most_bytes: int = MOST_BYTES) -> "DynamicScene":
         """The same, on the CPU with its levels as one, which remembers frames; where they are learned, as it is."""
-        level = composed_level(self.levels, self.indices, self.logits)
+        level = composed_level(self.levels, self.indices, self.logits, most_bytes)
         if level is None:
             return self
         numbers = torch.arange(len(self.moving))[:, None]

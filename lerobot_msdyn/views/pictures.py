@@ -13,6 +13,7 @@ from torch import Tensor
 from lerobot_msdyn.core.cameras import CameraTrack
 from lerobot_msdyn.core.config import Fill, Recipe
 from lerobot_msdyn.core.serialise import to_device
+from lerobot_msdyn.motion.model.composed import MOST_BYTES
 from lerobot_msdyn.reconstruction.result import FittedWindow, Reconstruction
 from lerobot_msdyn.render.cpu.threads import each_on
 from lerobot_msdyn.scene.dynamic import DynamicScene
@@ -89,13 +90,15 @@ def coverages(scene: Reconstruction, camera: CameraTrack, frames: Tensor | None 
         yield from of_frames
 
 
-def on_device(scene: Reconstruction, device: torch.device) -> Reconstruction:
-    """The same reconstruction with all that new views are rendered from and compared with on a device."""
-    windows = tuple(
-        replace(window, scene=to_device(window.scene, device), evidence=to_device(window.evidence, device))
-        for window in scene.windows
-    )
-    return replace(scene, windows=windows)
+def for_many_views(scene: Reconstruction, device: torch.device) -> Reconstruction:
+    """The same reconstruction with all that new views need on a device; on the CPU, motion is composed once a frame."""
+    room = MOST_BYTES // len(scene.windows)
+
+    def prepared(window: FittedWindow) -> FittedWindow:
+        moved, evidence = to_device((window.scene, window.evidence), device)
+        return replace(window, scene=moved.composed(room), evidence=evidence)
+
+    return replace(scene, windows=tuple(prepared(window) for window in scene.windows))
 
 
 class UnseenMasks:

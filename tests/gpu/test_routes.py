@@ -12,7 +12,7 @@ from lerobot_msdyn.reconstruction.account import decibels
 from lerobot_msdyn.reconstruction.reconstruct import reconstruct
 from lerobot_msdyn.render.availability import cuda_problem
 from lerobot_msdyn.synthetic import make_scene
-from lerobot_msdyn.views.pictures import new_pictures, on_device
+from lerobot_msdyn.views.pictures import for_many_views, new_pictures
 
 pytestmark = [pytest.mark.gpu, pytest.mark.slow]
 
@@ -36,7 +36,7 @@ def test_both_routes_reach_the_same_held_out_quality() -> None:
         scene = reconstruct(View(seen.rgb, video.camera, seen.depth), recipe)
         assert scene.windows[0].scene.device.type == "cpu"
         held_out_db[device] = decibels(float(scene.windows[0].self_check.fitted_error.mean()))
-        ready = on_device(scene, torch.device(device))
+        ready = for_many_views(scene, torch.device(device))
         pictures[device] = next(new_pictures(ready, scene.camera)).rgb.astype(float)
     assert abs(held_out_db["cuda"] - held_out_db["cpu"]) < MAX_DIFFERENCE_DB, held_out_db
     assert abs(pictures["cuda"] - pictures["cpu"]).mean() < 2

@@ -71,8 +71,7 @@ def test_frames_are_composed_once_as_far_as_there_is_room(scene: DynamicScene, m
     calls: list[None] = []
     add_level = composed.add_level
     monkeypatch.setattr(composed, "add_level", lambda *given: calls.append(add_level(*given)))
-    monkeypatch.setattr(composed, "MOST_BYTES", 2 * len(scene.moving) * 64)
-    one = scene.composed()
+    one = scene.composed(most_bytes=2 * len(scene.moving) * 64)
     for frame in (0, 1, 2):
         for _ in range(3):
             one.at(torch.tensor([frame]))

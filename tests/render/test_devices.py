@@ -28,7 +28,7 @@ from lerobot_msdyn.reconstruction.self_check import self_check
 from lerobot_msdyn.scene import rendering
 from lerobot_msdyn.scene.dynamic import DynamicScene
 from lerobot_msdyn.views.gate import judge
-from lerobot_msdyn.views.pictures import GPU_BATCH, coverages, new_pictures, on_device
+from lerobot_msdyn.views.pictures import GPU_BATCH, coverages, for_many_views, new_pictures
 
 pytestmark = pytest.mark.slow
 
@@ -115,7 +115,7 @@ def test_what_is_made_of_a_fit(gpu: FakeGpu) -> None:
         window = FittedWindow(0, *host, check, STEPS, 0.0, {})
         stands = Stands((Stand(0, len(view), 0.0),))
         scene = Reconstruction((window,), True, {}, view.camera, 1.0, LEVEL, stands)
-        ready = on_device(scene, GPU)
+        ready = for_many_views(scene, GPU)
         gpu.waits.clear()
         gpu.copies.clear()
         pictures = list(new_pictures(ready, view.camera, fill="none"))

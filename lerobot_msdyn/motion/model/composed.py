@@ -28,9 +28,10 @@ class ComposedLevel:
         levels: tuple[MotionLevel, ...],
         indices: tuple[Int[Tensor, "n _"], ...],
         logits: tuple[Float[Tensor, "n _"], ...],
+        most_bytes: int = MOST_BYTES,
     ) -> None:
-        """Levels from coarse to fine, and what the points follow in each."""
-        self.levels, self.indices, self.logits = levels, indices, logits
+        """Levels from coarse to fine, what the points follow in each, and how much is remembered."""
+        self.levels, self.indices, self.logits, self._most_bytes = levels, indices, logits, most_bytes
         self._known: dict[int, tuple[Tensor, Tensor]] = {}  # by frame
 
     def carry(
@@ -70,7 +71,7 @@ class ComposedLevel:
         known = self._known.get(frame)
         if known is None:
             known = self._composed(torch.tensor([frame]))
-            if (len(self._known) + 1) * len(self.indices[0]) * _BYTES <= MOST_BYTES:
+            if (len(self._known) + 1) * len(self.indices[0]) * _BYTES <= self._most_bytes:
                 self._known[frame] = known
         return known
 
@@ -86,7 +87,10 @@ class ComposedLevel:
 
 
 def composed_level(
-    levels: Sequence[Level], indices: tuple[Int[Tensor, "n _"], ...], logits: tuple[Float[Tensor, "n _"], ...]
+    levels: Sequence[Level],
+    indices: tuple[Int[Tensor, "n _"], ...],
+    logits: tuple[Float[Tensor, "n _"], ...],
+    most_bytes: int = MOST_BYTES,
 ) -> ComposedLevel | None:
     """All levels as one; None where they are learned, or not all of bases, or not in float32 on the CPU."""
     bases = tuple(level for level in levels if isinstance(level, MotionLevel))
@@ -94,4 +98,4 @@ def composed_level(
     usable = all(values.dtype == torch.float32 and values.device.type == "cpu" for values in tensors)
     if not bases or len(bases) < len(levels) or not usable or any(values.requires_grad for values in tensors):
         return None
-    return ComposedLevel(bases, indices, logits)
+    return ComposedLevel(bases, indices, logits, most_bytes)
