@@ -137,9 +137,10 @@ def measure(case: Case, root: Path, recipe_name: str, steps: int | None, pipe: C
     from lerobot_msdyn.dataset.encode import stage_pictures
     from lerobot_msdyn.dataset.read import open_source, read_episode
     from lerobot_msdyn.reconstruction.reconstruct import STEPS, reconstruct
+    from lerobot_msdyn.render.devices import chosen_device
     from lerobot_msdyn.render.warmup import warm_up
     from lerobot_msdyn.views.new_cameras import new_cameras
-    from lerobot_msdyn.views.pictures import new_pictures
+    from lerobot_msdyn.views.pictures import for_many_views, new_pictures
 
     seconds: dict[str, float] = defaultdict(float)
     said: list[str] = []
@@ -170,6 +171,7 @@ def measure(case: Case, root: Path, recipe_name: str, steps: int | None, pipe: C
             if case.whole:
                 copy(source, index, source.camera_keys, Path(folder) / "copied")
             scene = rebuild(view, recipe, backgrounds=backgrounds.get(key, []), steps=timed_steps)
+            scene = for_many_views(scene, chosen_device(recipe.device))
             for variant in range(case.variants):
                 camera = new_cameras({key: scene}, recipe, index, variant).cameras[key]
                 render(new_pictures(scene, camera, fill=recipe.fill))
