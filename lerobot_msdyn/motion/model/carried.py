@@ -215,6 +215,26 @@ def _product(
     )
 
 
+@inlined
+def _write_moved(map_: ndarray, positions: ndarray, moved: ndarray, time: int, point: int) -> None:
+    """Where a map [12] takes a point."""
+    x, y, z = positions[time, point]
+    for axis in range(3):
+        row = 4 * axis
+        moved[time, point, axis] = map_[row] * x + map_[row + 1] * y + map_[row + 2] * z + map_[row + 3]
+
+
+@inlined
+def _write_turned(
+    pw: float, px: float, py: float, pz: float, quats: ndarray, turned: ndarray, time: int, point: int
+) -> None:
+    """How a point is turned after a rotation p."""
+    qw, qx, qy, qz = quats[time, point]
+    rw, rx, ry, rz = _product(pw, px, py, pz, qw, qx, qy, qz)
+    turned[time, point, 0], turned[time, point, 1] = rw, rx
+    turned[time, point, 2], turned[time, point, 3] = ry, rz
+
+
 @compiled
 def _forward(
     tickets: ndarray,
@@ -236,18 +256,12 @@ def _forward(
         time, block = ticket // blocks, ticket % blocks
         for point in range(block * POINTS_PER_TICKET, min(count, (block + 1) * POINTS_PER_TICKET)):
             _blended(map_, affines, weights, indices, time, point)
-            x, y, z = positions[time, point]
-            for axis in range(3):
-                row = 4 * axis
-                moved[time, point, axis] = map_[row] * x + map_[row + 1] * y + map_[row + 2] * z + map_[row + 3]
+            _write_moved(map_, positions, moved, time, point)
             if oriented:
                 a0, a1, a2, b0, b1, b2, _ = _columns(map_, indices, weights, affines, time, point)
                 x0, x1, x2, y0, y1, y2, _, _, _ = _frame(a0, a1, a2, b0, b1, b2)
                 pw, px, py, pz = _quaternion(x0, x1, x2, y0, y1, y2)
-                qw, qx, qy, qz = quats[time, point]
-                rw, rx, ry, rz = _product(pw, px, py, pz, qw, qx, qy, qz)
-                turned[time, point, 0], turned[time, point, 1] = rw, rx
-                turned[time, point, 2], turned[time, point, 3] = ry, rz
+                _write_turned(pw, px, py, pz, quats, turned, time, point)
         ticket = take_ticket(tickets)
 
 
@@ -292,12 +306,10 @@ def _backward(
                 a0, a1, a2, b0, b1, b2, single = _columns(map_, indices, weights, affines, time, point)
                 x0, x1, x2, y0, y1, y2, length, along, rest = _frame(a0, a1, a2, b0, b1, b2)
                 pw, px, py, pz = _quaternion(x0, x1, x2, y0, y1, y2)
-                gw, gx, gy, gz = turned[time, point]
-                tw, tx, ty, tz = _product(pw, -px, -py, -pz, gw, gx, gy, gz)
-                to_quats[time, point, 0], to_quats[time, point, 1] = tw, tx
-                to_quats[time, point, 2], to_quats[time, point, 3] = ty, tz
+                _write_turned(pw, -px, -py, -pz, turned, to_quats, time, point)
                 if not learned:
                     continue
+                gw, gx, gy, gz = turned[time, point]
                 z0, z1, z2 = x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
                 qw, qx, qy, qz = quats[time, point]
                 rw, rx, ry, rz = _product(pw, px, py, pz, qw, qx, qy, qz)
@@ -355,10 +367,7 @@ def _add_level(
             a0, a1, a2, b0, b1, b2, _ = _columns(map_, indices, weights, affines, time, point)
             x0, x1, x2, y0, y1, y2, _, _, _ = _frame(a0, a1, a2, b0, b1, b2)
             pw, px, py, pz = _quaternion(x0, x1, x2, y0, y1, y2)
-            qw, qx, qy, qz = turns[time, point]
-            rw, rx, ry, rz = _product(pw, px, py, pz, qw, qx, qy, qz)
-            turns[time, point, 0], turns[time, point, 1] = rw, rx
-            turns[time, point, 2], turns[time, point, 3] = ry, rz
+            _write_turned(pw, px, py, pz, turns, turns, time, point)
         ticket = take_ticket(tickets)
 
 
@@ -379,16 +388,9 @@ def _apply(
     while ticket < batch * blocks:
         time, block = ticket // blocks, ticket % blocks
         for point in range(block * POINTS_PER_TICKET, min(count, (block + 1) * POINTS_PER_TICKET)):
-            map_ = maps[time, point]
-            x, y, z = positions[time, point]
-            for axis in range(3):
-                row = 4 * axis
-                moved[time, point, axis] = map_[row] * x + map_[row + 1] * y + map_[row + 2] * z + map_[row + 3]
+            _write_moved(maps[time, point], positions, moved, time, point)
             pw, px, py, pz = turns[time, point]
-            qw, qx, qy, qz = quats[time, point]
-            rw, rx, ry, rz = _product(pw, px, py, pz, qw, qx, qy, qz)
-            turned[time, point, 0], turned[time, point, 1] = rw, rx
-            turned[time, point, 2], turned[time, point, 3] = ry, rz
+            _write_turned(pw, px, py, pz, quats, turned, time, point)
         ticket = take_ticket(tickets)
 
 
@@ -414,8 +416,5 @@ def _apply_back(
             for axis in range(3):
                 to_positions[time, point, axis] = map_[axis] * g0 + map_[4 + axis] * g1 + map_[8 + axis] * g2
             pw, px, py, pz = turns[time, point]
-            gw, gx, gy, gz = turned[time, point]
-            tw, tx, ty, tz = _product(pw, -px, -py, -pz, gw, gx, gy, gz)
-            to_quats[time, point, 0], to_quats[time, point, 1] = tw, tx
-            to_quats[time, point, 2], to_quats[time, point, 3] = ty, tz
+            _write_turned(pw, -px, -py, -pz, turned, to_quats, time, point)
         ticket = take_ticket(tickets)
