@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from lerobot_msdyn.core.cameras import CameraTrack
@@ -20,12 +20,11 @@ class StillView:
     rgb: Float[Tensor, "s 3"]  # 0..1, before brightness
     shading: Shading | None  # none: it does not change
 
-    def at(self, frames: Float[Tensor, " b"] | Int[Tensor, " b"], hidden: Bool[Tensor, " s"] | None = None) -> Painted:
-        """As some frames show it, without what is hidden."""
-        shape, device = self.rgb.shape[:1], self.rgb.device
-        gains = torch.ones(shape, device=device) if self.shading is None else self.shading.static_gain(frames)
-        hidden = torch.zeros(shape, dtype=torch.bool, device=device) if hidden is None else hidden
-        return Painted(self.backdrop, self.rgb, gains, hidden)
+    def at(self, frames: Float[Tensor, " b"] | Int[Tensor, " b"]) -> Painted:
+        """As some frames show it, with nothing hidden."""
+        one = torch.ones_like(self.rgb[:, 0])
+        gains = one if self.shading is None else self.shading.static_gain(frames)
+        return Painted(self.backdrop, self.rgb, gains, torch.zeros_like(one, dtype=torch.bool))
 
 
 @torch.no_grad()
