@@ -29,6 +29,8 @@ class Backdrop:
     opacities: Float[Tensor, " s"]
     camera_from_world: Float[Tensor, "4 4"]
     intrinsics: Float[Tensor, "3 3"]  # px
+    width: int  # px
+    height: int  # px
     near: float  # m
     splats: Splats | None  # None: it is projected in every picture
 
@@ -38,10 +40,9 @@ class Backdrop:
 
 @dataclass(frozen=True)
 class Painted:
-    """A backdrop with the colours that it has in some pictures, which see it from its own pose; without gradients.
+    """A backdrop with the colours that it has in some pictures through its own camera; without gradients.
 
-    They may be windows of its own picture: of other sizes, and with another principal point. Features are the same in
-    all, gains and what is hidden may be of each.
+    Features are the same in all pictures, gains and what is hidden may be of each.
     """
 
     backdrop: Backdrop
@@ -79,18 +80,24 @@ class Painted:
                 )
 
     def check_cameras(
-        self, camera_from_world: Float[Tensor, "b 4 4"], intrinsics: Float[Tensor, "b 3 3"], near: float
+        self,
+        camera_from_world: Float[Tensor, "b 4 4"],
+        intrinsics: Float[Tensor, "b 3 3"],
+        width: int,
+        height: int,
+        near: float,
     ) -> None:
         """Whether it was projected for these views.
 
         Raises:
-            RenderError: a pose, focal length or the near plane is another one, or poses are learned.
+            RenderError: it was for another camera, size or near plane, or poses are learned.
         """
         own = self.backdrop
-        same = bool((camera_from_world == own.camera_from_world).all()) and near == own.near
-        same &= bool((intrinsics[:, :2, :2] == own.intrinsics[:2, :2]).all())
+        same = (width, height, near) == (own.width, own.height, own.near)
+        same &= bool((camera_from_world == own.camera_from_world).all() and (intrinsics == own.intrinsics).all())
         if not same or camera_from_world.requires_grad:
             raise RenderError(
-                "the backdrop was projected for another pose, focal length or near plane, or the pose is learned; "
-                "expected views from where it was projected: project it anew, or give its Gaussians with the others"
+                "the backdrop was projected for another pose, intrinsics, size or near plane, or the pose is learned; "
+                "expected views like the one for which it was projected: project it anew, or give its Gaussians with "
+                "the others"
             )

@@ -66,22 +66,14 @@ def rasterize(
         "features": features,
     }
     check_shapes(gaussians, {"camera_from_world": camera_from_world, "intrinsics": intrinsics}, width, height)
-    if not near > 0:
-        raise RenderError(f"near is {near} m; expected a positive distance")
-    if backend not in BACKENDS:
-        raise RenderError(f"backend is {backend!r}; expected one of {', '.join(BACKENDS)}")
-    if backend == "auto":
-        backend = _best_backend(means, features)
-    implementation, problem = _load(backend)
-    if implementation is None:
-        raise RenderError(f"backend {backend!r} cannot be used: {problem}; use backend='reference'")
+    backend, implementation = _chosen(backend, near, means, features)
     cameras = (camera_from_world, intrinsics, width, height, near)
     if backdrop is None:
         return implementation(*gaussians.values(), *cameras)
     backdrop.check_shapes(len(camera_from_world), features.shape[-1])
     learned = torch.is_grad_enabled() and any(values.requires_grad for values in gaussians.values())
     if backend == "cpu" and backdrop.backdrop.splats is not None and not learned:
-        backdrop.check_cameras(camera_from_world, intrinsics, near)
+        backdrop.check_cameras(camera_from_world, intrinsics, width, height, near)
         return implementation(*gaussians.values(), *cameras, backdrop)
     return implementation(*_with_backdrop(gaussians, backdrop), *cameras)
 
@@ -113,11 +105,11 @@ def project_backdrop(
     cameras = {"camera_from_world": camera_from_world[None], "intrinsics": intrinsics[None]}
     check_shapes(gaussians, cameras, width, height)
     splats = None
-    if not once and (_best_backend(means, features) if backend == "auto" else backend) == "cpu":
+    if _chosen(backend, near, means, features)[0] == "cpu" and not once:
         from lerobot_msdyn.render.cpu.rasterizer import project_cpu
 
         splats = project_cpu(means, quats, scales, opacities, camera_from_world, intrinsics, width, height, near)
-    return Backdrop(means, quats, scales, opacities, camera_from_world, intrinsics, near, splats)
+    return Backdrop(means, quats, scales, opacities, camera_from_world, intrinsics, width, height, near, splats)
 
 
 def _with_backdrop(gaussians: dict[str, Tensor], painted: Painted) -> list[Tensor]:
@@ -131,6 +123,24 @@ def _with_backdrop(gaussians: dict[str, Tensor], painted: Painted) -> list[Tenso
             values = values.expand(len(first), *values.shape)
         joined.append(torch.cat((first, values), dim=-1 if name == "opacities" else -2))
     return joined
+
+
+def _chosen(backend: str, near: float, means: Tensor, features: Tensor) -> tuple[str, Callable[..., Raster]]:
+    """The backend that is meant, and its function.
+
+    Raises:
+        RenderError: there is no such backend, it cannot be used, or the near plane is not before the camera.
+    """
+    if not near > 0:
+        raise RenderError(f"near is {near} m; expected a positive distance")
+    if backend not in BACKENDS:
+        raise RenderError(f"backend is {backend!r}; expected one of {', '.join(BACKENDS)}")
+    if backend == "auto":
+        backend = _best_backend(means, features)
+    implementation, problem = _load(backend)
+    if implementation is None:
+        raise RenderError(f"backend {backend!r} cannot be used: {problem}; use backend='reference'")
+    return backend, implementation
 
 
 def _best_backend(means: Tensor, features: Tensor) -> str:

@@ -11,7 +11,6 @@ from lerobot_msdyn.core.errors import RenderError
 from lerobot_msdyn.render import Painted, Raster, project_backdrop, rasterize
 
 STILL, OTHERS, WIDTH, HEIGHT, VIEWS = 200, 150, 130, 70, 3
-WINDOW = slice(11, 60), slice(37, 101)  # rows and columns
 
 
 @pytest.fixture
@@ -64,17 +63,6 @@ def test_pictures_are_those_of_all_gaussians_to_the_bit(still, others):
     assert (seen(still, others, None).alpha - expected.alpha).abs().max() > 0.5, "the backdrop is seen"
 
 
-def test_windows_of_the_picture(still, others):
-    nothing = dataclasses.replace(others, gaussians=tuple(values[:0] for values in others.gaussians))
-    whole = together(still, nothing, still.intrinsics, WIDTH, HEIGHT)
-    intrinsics = still.intrinsics.clone()
-    intrinsics[:, 0, 2] -= WINDOW[1].start
-    intrinsics[:, 1, 2] -= WINDOW[0].start
-    size = (WINDOW[1].stop - WINDOW[1].start, WINDOW[0].stop - WINDOW[0].start)
-    part = Raster(*(values[:, *WINDOW] for values in vars(whole).values()))
-    assert_same(part, seen(still, nothing, painted(still), intrinsics=intrinsics, size=size), atol=1e-4)
-
-
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 @pytest.mark.parametrize("once", [False, True])
 def test_gains_and_what_is_hidden_may_be_of_each_view(still, others, backend, once):
@@ -118,7 +106,14 @@ def test_what_does_not_fit_is_named(still, others):
     backdrop = painted(still)
     moved = still.poses.clone()
     moved[0, 0, 3] += 0.1
-    for wrong in ({"poses": moved}, {"near": 0.2}, {"poses": still.poses.clone().requires_grad_()}):
+    learned, wider = still.poses.clone().requires_grad_(), still.intrinsics + torch.eye(3)
+    for wrong in (
+        {"poses": moved},
+        {"near": 0.2},
+        {"poses": learned},
+        {"intrinsics": wider},
+        {"size": (WIDTH - 1, HEIGHT)},
+    ):
         with pytest.raises(RenderError, match="was projected for another pose"):
             seen(still, others, backdrop, **wrong)
     with pytest.raises(RenderError, match=r"features of the backdrop have shape \[200, 2\]; expected \[200, 3\]"):
@@ -133,6 +128,11 @@ def test_what_does_not_fit_is_named(still, others):
     bad[first, 1] = float("nan")
     with pytest.raises(RenderError, match=r"the backdrop's features at index .* is nan; expected a finite number"):
         seen(still, others, dataclasses.replace(backdrop, plain=bad))
+    arguments: Any = (*still.gaussians[:4], still.poses[0], still.intrinsics[0], WIDTH, HEIGHT)
+    with pytest.raises(RenderError, match="near is 0.0 m; expected a positive distance"):
+        project_backdrop(*arguments, near=0.0)
+    with pytest.raises(RenderError, match="backend is 'gpu'; expected one of auto, reference, cpu, cuda"):
+        project_backdrop(*arguments, backend="gpu")
     still.gaussians[3][4] = 2.0
     with pytest.raises(RenderError, match=r"opacities at index \[4\] is 2; expected 0..1"):
         painted(still)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_msdyn.robots import Robot, link_poses, load_robot
+from lerobot_msdyn.robots import Robot, load_robot
+from lerobot_msdyn.robots.kinematics import link_poses
 
 TWO = """<robot name="two">
 <link name="base"><visual><geometry><box size="1 1 1"/></geometry></visual></link><link name="arm"/><link name="slide"/>

@@ -176,7 +176,7 @@ def project_forward(
 
 @kernel
 def paint_backdrop(
-    tickets, sources, heads, nearness, features, gains, hidden, shifts, width, height, layout,
+    tickets, sources, heads, nearness, features, gains, hidden, width, height, layout,
     records, rects, counts, depths, refused,
 ):  # fmt: skip
     """What `project_forward` writes, of the Gaussians of a backdrop, which have been projected before.
@@ -189,7 +189,6 @@ def paint_backdrop(
         features: of all of the backdrop, `[s, c]`.
         gains: by which they are multiplied, `[1 or b, s]`.
         hidden: those that are left out, `[1 or b, s]`.
-        shifts: of each view against the backdrop's own picture, px, `[b, 2]`.
         width: of the views, px.
         height: of the views, px.
         layout: the kernel's planes.
@@ -215,16 +214,15 @@ def paint_backdrop(
             source = sources[place]
             if hidden[hidden_view, source]:
                 continue
-            center_x, center_y = heads[place, CENTER_X] + shifts[view, 0], heads[place, CENTER_Y] + shifts[view, 1]
-            rect = _tiles_met(center_x, center_y, heads[place, HALF_WIDTH], heads[place, HALF_HEIGHT], width, height)
+            head = heads[place]
+            rect = _tiles_met(head[CENTER_X], head[CENTER_Y], head[HALF_WIDTH], head[HALF_HEIGHT], width, height)
             counts[view, place] = _write_rect(rects, view, place, rect)
             if counts[view, place] == 0:
                 continue
             depths[view, place] = nearness[place]
             base = (view * counts.shape[1] + place) * stride
             for entry in range(HEAD):
-                records[base + entry] = heads[place, entry]
-            records[base + CENTER_X], records[base + CENTER_Y] = center_x, center_y
+                records[base + entry] = head[entry]
             for channel in range(channels):
                 value = features[source, channel] * gains[gains_view, source]
                 records[base + HEAD + channel] = value

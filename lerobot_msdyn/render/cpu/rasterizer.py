@@ -154,7 +154,7 @@ def _project(
     inputs: tuple[Tensor, ...], width: int, height: int, near: float, backdrop: Painted | None = None, *, kept: bool
 ) -> _Projected:
     """Project and list per tile; `kept`: for the backward pass."""
-    features, cameras, intrinsics = inputs[4:7]
+    features, cameras = inputs[4:6]
     splats = _NOTHING if backdrop is None else backdrop.backdrop.splats
     assert splats is not None
     ahead, views = len(splats.heads), cameras.shape[0]
@@ -166,10 +166,9 @@ def _project(
     out = (records, rects, counts, depths, refused)
     if backdrop is not None:
         gains, hidden = torch.atleast_2d(backdrop.gains, backdrop.hidden)
-        shifts = intrinsics[:, :2, 2] - backdrop.backdrop.intrinsics[:2, 2]
         run(
             paint_backdrop, views * -(-ahead // CHUNK), splats.sources, splats.heads, splats.depths,
-            *_arrays(backdrop.plain, gains, hidden, shifts), width, height, layout, *out,
+            *_arrays(backdrop.plain, gains, hidden), width, height, layout, *out,
         )  # fmt: skip
     run(
         project_forward, views * -(-(count - ahead) // CHUNK), *_arrays(*inputs), width, height, np.float32(near),
