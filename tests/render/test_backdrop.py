@@ -129,7 +129,7 @@ def test_what_does_not_fit_is_named(still, others):
     with pytest.raises(RenderError, match=r"the backdrop's features at index .* is nan; expected a finite number"):
         seen(still, others, dataclasses.replace(backdrop, plain=bad))
     arguments: Any = (*still.gaussians[:4], still.poses[0], still.intrinsics[0], WIDTH, HEIGHT)
-    with pytest.raises(RenderError, match="near is 0.0 m; expected a positive distance"):
+    with pytest.raises(RenderError, match=r"near is 0\.0 m; expected a positive distance"):
         project_backdrop(*arguments, near=0.0)
     with pytest.raises(RenderError, match="backend is 'gpu'; expected one of auto, reference, cpu, cuda"):
         project_backdrop(*arguments, backend="gpu")
